@@ -9,8 +9,8 @@ from sim.cloth.state import ClothState
 class ClothContacts(Protocol):
     """A kind of contact: of cloths with themselves and each other, with bodies, with walls."""
 
-    def stable_dt(self, state: ClothState) -> float:
-        """Largest step [s] for the current state; infinite without a limit."""
+    def stable_dt(self, state: ClothState, at_most: float) -> float:
+        """Largest step [s] for the current state, `at_most` this one."""
 
     def resolve(self, state: ClothState, dt: float) -> None:
         """Change the displacements of a step of dt [s], after the springs have; pinned nodes stay as they are."""

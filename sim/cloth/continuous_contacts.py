@@ -17,7 +17,7 @@ from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
-from sim.cloth.self_collision import SelfCollision, half_range
+from sim.cloth.self_collision import SelfCollision, box_of
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short
@@ -138,11 +138,15 @@ class ContinuousContacts:
 
     # --- what the solver asks ---------------------------------------------------------------------------------------
 
-    def stable_dt(self, state: ClothState) -> float:
-        """Largest step [s] in which cloth moves little against itself and against bodies."""
-        deviation, speed = half_range(state.velocity, state.vertex_count, self._ends)
-        own = LARGEST_MOTION * self._pairs.mean_edge / deviation if deviation > 0.0 and self._meets_cloth else math.inf
-        return min(own, self.rigid.stable_dt(speed))
+    def stable_dt(self, state: ClothState, at_most: float) -> float:
+        """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
+        velocity = box_of(state.velocity, state.vertex_count, self._ends)
+        deviation = float(np.linalg.norm(velocity[1]))
+        if deviation > 0.0 and self._meets_cloth:
+            at_most = min(at_most, LARGEST_MOTION * self._pairs.mean_edge / deviation)
+        return self.rigid.stable_dt(
+            *velocity, lambda: box_of(state.position, state.vertex_count, self._ends), at_most=at_most
+        )
 
     def begin_frame(self) -> None:
         """Count anew, and expect of contacts what a run does that continues here."""

@@ -1,7 +1,7 @@
 """Cloth against rigid bodies and walls: what touches in a substep."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +84,10 @@ class RigidContact:
     def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float], walls: Sequence[Wall]) -> None:
         self.bodies = CollisionBodies(geometries, friction)
         self._motion: BodyMotion | None = None
-        self._surface_speed = 0.0
+        self._shortest_edge = np.array([geometry.shortest_edge for geometry in geometries])
+        self._radius = np.array([geometry.radius for geometry in geometries])
+        self._position = self._velocity = np.zeros((len(geometries), 3))
+        self._spin_speed = np.zeros(len(geometries))
         self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
         self._spacing, self._largest_half = 0.0, 0.0
         self._taken = ti.ndarray(ti.i32, 1)
@@ -121,14 +124,13 @@ class RigidContact:
         """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
         b = self.bodies.count
         inverse_mass, inverse_inertia = np.zeros(b), np.zeros((b, 3, 3))
-        self._surface_speed, self._motion = 0.0, motion
+        self._position, self._velocity, self._spin_speed = poses.position[:b], np.zeros((b, 3)), np.zeros(b)
+        self._motion = motion
         if motion is not None:
             m = len(motion.velocity)
             inverse_mass[:m], inverse_inertia[:m] = motion.inverse_mass, motion.inverse_inertia
-            radius = np.array([geometry.radius for geometry in self.bodies.geometries[:m]])
-            spin = np.linalg.norm(motion.angular_velocity, axis=1)
-            speeds = np.linalg.norm(motion.velocity, axis=1) + radius * spin
-            self._surface_speed = float(speeds.max(initial=0.0))
+            self._velocity[:m] = motion.velocity
+            self._spin_speed[:m] = self._radius[:m] * np.linalg.norm(motion.angular_velocity, axis=1)
         self.bodies.place(poses, inverse_mass, inverse_inertia)
 
     def begin_substep(self, dt: float) -> None:
@@ -141,12 +143,27 @@ class RigidContact:
             turn[:m] = dt * motion.angular_velocity
             self.bodies.set_motion(shift, turn)
 
-    def stable_dt(self, speed: float) -> float:
-        """Largest step [s] for cloth of this speed [m/s]."""
-        relative = speed + self._surface_speed
-        if relative == 0.0 or not self.bodies.count:
-            return math.inf
-        return LARGEST_ADVANCE * 0.5 * self.bodies.shortest_edge / relative
+    def stable_dt(
+        self, velocity: Array, spread: Array, box: Callable[[], tuple[Array, Array]], *, at_most: float
+    ) -> float:
+        """Largest step [s] for cloth that moves like this.
+
+        A body that is not near the cloth's box may come half of the way in a step.
+
+        Args:
+            velocity, spread: middle and half edges of the box around its velocities [m/s], (3,).
+            box: middle and half edges of the box around it [m], (3,) each; asked for if it matters.
+            at_most: the largest step otherwise [s].
+        """
+        closing = np.linalg.norm(np.abs(self._velocity - velocity) + spread, axis=1)
+        limits = LARGEST_ADVANCE * 0.5 * self._shortest_edge / np.maximum(closing + self._spin_speed, 1.0e-30)
+        fast = np.flatnonzero(limits < at_most)
+        if len(fast):
+            middle, half = box()
+            beyond = np.maximum(np.abs(self._position[fast] - middle) - half, 0.0)
+            room = np.linalg.norm(beyond, axis=1) - self._radius[fast] - self._largest_half
+            limits[fast] = np.maximum(limits[fast], 0.5 * room / np.maximum(closing[fast], 1.0e-30))
+        return min(at_most, float(limits.min(initial=math.inf)))
 
     def find(
         self,

@@ -38,7 +38,6 @@ class CollisionBodies(DeviceShapes):
         gathered, impulse: integers, of linear and angular impulse times the step, (6 b,).
         load: integers, sums over the contacts of a body, in `load_unit`s, (b,).
         may_move: whether forces move any of them, or ever did.
-        shortest_edge: of the smallest body [m].
 
     Args:
         geometries: of the bodies.
@@ -59,7 +58,6 @@ class CollisionBodies(DeviceShapes):
             array.fill(0)
         self.load_unit = 1.0
         self.may_move = False
-        self.shortest_edge = min((geometry.shortest_edge for geometry in geometries), default=np.inf)
         if self.count:
             self.set_friction(np.asarray(friction, dtype=np.float64))
             self.look_between_vertices(0.0)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from sim.cloth.bundles import PatchMotion, Searches
 from sim.cloth.element_blocks import ElementBlocks
@@ -20,6 +21,8 @@ from sim.core.scheduling import is_short, workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
+
+Array = NDArray[np.float64]
 
 REACH_IN_EDGES = 0.85
 LEAST_SKIN_IN_EDGES = 0.15
@@ -213,10 +216,8 @@ class SelfCollision:
         )
 
 
-def half_range(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple[float, float]:
-    """How far vectors differ from a common one at most, by the diagonal of half their box; and their largest length.
-
-    Both are upper bounds, the same whatever the order of the vectors.
+def box_of(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple[Array, Array]:
+    """Middle and half edges of the box around vectors, (3,) each, the same whatever their order.
 
     Args:
         vectors: of which the first `count` are looked at.
@@ -225,5 +226,4 @@ def half_range(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple
     """
     numbers = range_of_vectors(vectors, count, ends_of.over(count), is_short(count, NODE_NS))
     ends = ends_of.unpack(numbers).astype(np.float64)
-    half = 0.5 * np.linalg.norm(ends[:3] + ends[3:])
-    return float(half), float(np.linalg.norm(np.maximum(np.abs(ends[:3]), np.abs(ends[3:]))))
+    return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])

@@ -209,7 +209,10 @@ class ClothSolver:
 
     def stable_dt(self) -> float:
         """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear."""
-        return min([self._own_dt, *(contacts.stable_dt(self.state) for contacts in self.contacts)])
+        dt = self._own_dt
+        for contacts in self.contacts:
+            dt = contacts.stable_dt(self.state, dt)
+        return dt
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""

@@ -27,7 +27,10 @@ LARGEST_DT = 2.0e-3
 """Largest step [s] of dynamic bodies, which holds a stack of boxes to a micrometre, and of bodies with keyframes, as
 nothing else looks ahead to where a path sets in."""
 
-LARGEST_ADVANCE = 0.25  # how far surfaces may get in a step, in half shortest edges of the smallest dynamic body
+LARGEST_ADVANCE = 0.25
+"""How far surfaces may get in a step, in half shortest edges of the smallest dynamic body; a body that nothing is near
+may get half of the way to what is nearest."""
+
 LARGEST_TURN = 0.1  # how far bodies may turn in a step [rad]: rotation errs by about a tenth of its square
 LOST_DISTANCE = 10.0  # a dynamic body farther from the domain's centre, in diagonals, is stopped: it fell out of sight
 
@@ -116,15 +119,20 @@ class RigidSolver:
         return float(np.max(self._surface_speeds(), initial=0.0))
 
     def stable_dt(self) -> float:
-        """Largest step [s] in which surfaces move and bodies turn little enough; gravity's part counts."""
+        """Largest step [s] in which bodies turn little, and those that may meet something move little.
+
+        Gravity's part counts.
+        """
         spin = float(np.max(np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1)), initial=0.0))
         dt = self._largest_dt if spin == 0.0 else min(self._largest_dt, LARGEST_TURN / spin)
         if not math.isfinite(self._largest_advance):
             return dt
-        # v dt + g dt² is the largest advance.
-        speed, acceleration = self.max_surface_speed(), float(np.linalg.norm(self.gravity))
-        root = speed + math.sqrt(speed**2 + 4.0 * acceleration * self._largest_advance)
-        return min(dt, 2.0 * self._largest_advance / root) if root > 0.0 else dt
+        speeds, acceleration = self._surface_speeds(), float(np.linalg.norm(self.gravity))
+        for number in np.argsort(-speeds):
+            if time_of(self._largest_advance, speeds[number], acceleration) >= dt:
+                break  # of slower ones, too
+            dt = min(dt, self._time_to_get_near(number, speeds, acceleration))
+        return dt
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
@@ -226,6 +234,32 @@ class RigidSolver:
         moved = np.sqrt(np.square(self.bodies.position - position).sum(axis=1))
         turned = np.sqrt(np.square(self.bodies.orientation - orientation).sum(axis=1))
         return moved + 2.0 * turned * self._radius
+
+    def _time_to_get_near(self, number: int, speeds: Array, acceleration: float) -> float:
+        """Time [s] in which a body that moves, and each thing that it may meet, get as far as a step may take them.
+
+        Spheres around bodies are looked at; the sum of both advances goes by the speed of one against the other.
+        """
+        bodies, speed = self.bodies, max(float(speeds[number]), 1.0e-30)
+        centre, others = bodies.position[number], np.arange(len(speeds)) != number
+        spins = speeds - np.sqrt(np.square(bodies.velocity).sum(axis=1))
+        relative = np.sqrt(np.square(bodies.velocity - bodies.velocity[number]).sum(axis=1)) + spins + spins[number]
+        room = np.sqrt(np.square(bodies.position - centre).sum(axis=1)) - self._radius
+        of_obstacles = [wall.distance(centre, centre) for wall in self.walls]
+        fixed = self.all_geometries[len(speeds) :]
+        # The domain comes after the obstacles.
+        for geometry, position, turn in zip(fixed, self._fixed_position, self._fixed_rotation, strict=False):
+            away = centre - position
+            if geometry.is_analytic:
+                of_obstacles.append(float(geometry.signed_distance((away @ turn)[None])[0]))
+            else:
+                of_obstacles.append(float(np.linalg.norm(away)) - geometry.radius)
+        still = np.ones(len(of_obstacles))
+        room = np.concatenate([room[others], of_obstacles]) - self._radius[number]
+        relative = np.concatenate([relative[others], speed * still])
+        both = np.concatenate([1.0 + np.minimum(1.0, speeds[others] / speed), still])
+        advance = np.maximum(both * self._largest_advance, 0.5 * room)
+        return float(np.min(time_of(advance, relative, acceleration), initial=np.inf))
 
     def _surface_speeds(self) -> Array:
         spin = np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1))
@@ -339,6 +373,12 @@ class RigidSolver:
         if speeds[fastest] > RUNAWAY_SPEED:
             return f'the speed of "{self.bodies.names[fastest]}" is {speeds[fastest]:.3g} m/s'
         return None
+
+
+def time_of(advance: Array | float, speed: Array | float, acceleration: float) -> Array:
+    """Time [s] in which v dt + g dt² is an advance [m], for speeds [m/s] and an acceleration [m/s²]."""
+    root = speed + np.sqrt(np.square(speed) + 4.0 * acceleration * np.asarray(advance))
+    return 2.0 * advance / np.maximum(root, 1.0e-300)
 
 
 def largest_dt(parameters: Sequence[RigidBodyParameters]) -> float:

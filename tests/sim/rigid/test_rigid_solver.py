@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
-from rigid_scenes import GRAVITY, advance, ball, body, cube, energy, in_room
+from rigid_scenes import GRAVITY, SPACE, advance, ball, body, cube, energy, in_room
 
 from sim.build import build_world
 from sim.core.motion import rotation
 from sim.core.world import World
+from sim.rigid.solver import RigidSolver
 from sim.rigid.start import check_start
 from sim.scene import SceneParameters
 
@@ -182,13 +183,38 @@ def test_divergence_names_the_body():
 
 
 def test_stable_step_shrinks_with_speed_and_spin():
-    def step(**motion) -> float:
-        return in_room(body("a", ball(0.01), (0, 0, 1), **motion)).stable_dt()
+    def step(height=0.012, **motion) -> float:
+        return in_room(body("a", ball(0.01), (0, 0, height), **motion)).stable_dt()
 
     # A quarter of the radius at 100 m/s; a tenth of a radian at 1000 rad/s. Gravity adds a little to the first.
     assert step(velocity=(100, 0, 0)) == pytest.approx(0.25 * 0.01 / 100, rel=1e-3)
     assert step(angular_velocity=(0, 0, 1000)) == pytest.approx(1e-4)
     assert step() == pytest.approx(2e-3)
+    # Its box has a radius of 17 mm; half of the way from there to the floor.
+    assert step(0.1, velocity=(100, 0, 0)) == pytest.approx(0.5 * (0.1 - 0.01 * 3**0.5) / 100, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        {"kind": "static", "shape": cube(0.02)},
+        {"kind": "static", "shape": {"type": "box", "size": (0.02, 2.0, 2.0)}},
+        {"kind": "dynamic", "shape": cube(0.02), "density": 1e6},
+        {"kind": "dynamic", "shape": ball(0.01), "density": 1e6, "velocity": (-150.0, 0.0, 0.0)},
+    ],
+)
+def test_a_bullet_takes_large_steps_on_its_way_and_hits_what_it_meets(target):
+    """At 150 m/s a quarter of its radius is passed in 8 microseconds: 1,600 steps of the way of 2 m."""
+    bullet = body("bullet", ball(0.005), (-1.0, 0.0, 0.0), velocity=(150.0, 0.0, 0.0))
+    other = body("target", target["shape"], (1.0, 0.0, 0.0), **{k: v for k, v in target.items() if k != "shape"})
+    is_static = target["kind"] == "static"
+    bodies, obstacles = ([bullet], [other]) if is_static else ([bullet, other], [])
+    solver = RigidSolver(bodies, obstacles=obstacles, domain=SPACE, gravity=(0, 0, 0))
+    assert advance(solver, 0.006) < 100
+    assert (solver.bodies.velocity[0, 0], solver.bodies.position[0, 0]) == (150.0, pytest.approx(-0.1))
+    assert advance(solver, 0.009) < 150
+    assert solver.bodies.velocity[0, 0] < 1.0  # it neither passed nor missed
+    assert solver.bodies.position[0, 0] < 1.0
 
 
 def test_bodies_that_are_led_are_where_their_paths_say_whatever_the_step():
