@@ -32,7 +32,8 @@ PATCHES_AT_A_TIME = 4
 """Patches that a thread takes at a time: those that touch a body take some microseconds each."""
 
 LARGEST_ADVANCE = 0.25
-"""How far cloth and bodies may move against each other in a step, in half shortest edges of the smallest body."""
+"""How far cloth and bodies that it may meet may move against each other in a step, in half shortest edges of the
+smallest body."""
 
 WALL_DEPTH = 4.0
 """Walls hold what is at most so far behind them, in thicknesses, or as far as a mean edge or the node's motion in the
@@ -84,7 +85,7 @@ class RigidContact:
     def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float], walls: Sequence[Wall]) -> None:
         self.bodies = CollisionBodies(geometries, friction)
         self._motion: BodyMotion | None = None
-        self._shortest_edge = np.array([geometry.shortest_edge for geometry in geometries])
+        self._shortest_edge = min((geometry.shortest_edge for geometry in geometries), default=math.inf)
         self._radius = np.array([geometry.radius for geometry in geometries])
         self._position = self._velocity = np.zeros((len(geometries), 3))
         self._spin_speed = np.zeros(len(geometries))
@@ -155,14 +156,16 @@ class RigidContact:
             box: middle and half edges of the box around it [m], (3,) each; asked for if it matters.
             at_most: the largest step otherwise [s].
         """
-        closing = np.linalg.norm(np.abs(self._velocity - velocity) + spread, axis=1)
-        limits = LARGEST_ADVANCE * 0.5 * self._shortest_edge / np.maximum(closing + self._spin_speed, 1.0e-30)
+        speed = np.linalg.norm(np.abs(velocity) + spread)
+        both = speed + np.linalg.norm(self._velocity, axis=1) + self._spin_speed
+        limits = LARGEST_ADVANCE * 0.5 * self._shortest_edge / np.maximum(both, 1.0e-30)
         fast = np.flatnonzero(limits < at_most)
         if len(fast):
             middle, half = box()
             beyond = np.maximum(np.abs(self._position[fast] - middle) - half, 0.0)
             room = np.linalg.norm(beyond, axis=1) - self._radius[fast] - self._largest_half
-            limits[fast] = np.maximum(limits[fast], 0.5 * room / np.maximum(closing[fast], 1.0e-30))
+            closing = np.linalg.norm(np.abs(self._velocity[fast] - velocity) + spread, axis=1)
+            limits[fast] = np.maximum(limits[fast], 0.5 * room / np.maximum(closing, 1.0e-30))
         return min(at_most, float(limits.min(initial=math.inf)))
 
     def find(
