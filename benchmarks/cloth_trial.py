@@ -20,6 +20,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.proximity import closest_on_edges, closest_on_triangle
+
 SIDE, DENSITY, GRAVITY = 1.0, 0.3, 9.81
 """Length of the sheet's sides [m], mass per area [kg/m²], acceleration [m/s²]."""
 
@@ -460,14 +462,15 @@ class TrialSheet:
     @ti.func
     def closest(self, q, is_edges):
         """Weights of the nodes of a pair in the vector between its closest points."""
-        a, b, c, d = self.x[q[0]], self.x[q[1]], self.x[q[2]], self.x[q[3]]
+        x = self.x[q[0]]
+        b, c, d = self.x[q[1]] - x, self.x[q[2]] - x, self.x[q[3]] - x
         found = vec4(0)
         if is_edges == 0:
-            o = barycentric(a, b, c, d)
+            o = closest_on_triangle(vec3(0), b, c, d)
             found = vec4(1, -o[0], -o[1], -o[2])
         else:
-            s, t = parameters_of_edges(a, b, c, d)
-            found = vec4(1 - s, s, t - 1, -t)
+            o = closest_on_edges(vec3(0), b, c, d)
+            found = vec4(1 - o[0], o[0], o[1] - 1, -o[1])
         return found
 
     @ti.func
@@ -890,47 +893,3 @@ class TrialSheet:
 def meet(low_a, high_a, low_b, high_b):
     """Whether two boxes do."""
     return (low_a <= high_b).all() and (low_b <= high_a).all()
-
-
-@ti.func
-def barycentric(p, a, b, c):
-    """Of the point of a triangle that is closest to p (Ericson 2005, 5.1.5)."""
-    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
-    d1, d2, d3, d4, d5, d6 = ab.dot(ap), ac.dot(ap), ab.dot(bp), ac.dot(bp), ab.dot(cp), ac.dot(cp)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    found = vec3(1, 0, 0)
-    if d1 <= 0 and d2 <= 0:
-        found = vec3(1, 0, 0)
-    elif d3 >= 0 and d4 <= d3:
-        found = vec3(0, 1, 0)
-    elif d6 >= 0 and d5 <= d6:
-        found = vec3(0, 0, 1)
-    elif vc <= 0 and d1 >= 0 and d3 <= 0:
-        t = d1 / (d1 - d3)
-        found = vec3(1 - t, t, 0)
-    elif vb <= 0 and d2 >= 0 and d6 <= 0:
-        t = d2 / (d2 - d6)
-        found = vec3(1 - t, 0, t)
-    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
-        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        found = vec3(0, 1 - t, t)
-    else:
-        s = 1.0 / (va + vb + vc)
-        found = vec3(1 - (vb + vc) * s, vb * s, vc * s)
-    return found
-
-
-@ti.func
-def parameters_of_edges(p0, p1, q0, q1):
-    """Where two edges are closest to each other, from 0 to 1 along each (Ericson 2005, 5.1.9)."""
-    d1, d2, r = p1 - p0, q1 - q0, p0 - q0
-    a, e, f, c, b = d1.dot(d1), d2.dot(d2), d2.dot(r), d1.dot(r), d1.dot(d2)
-    s, parallel = 0.5, a * e - b * b
-    if parallel > 1e-6 * a * e:
-        s = ti.math.clamp((b * f - c * e) / parallel, 0.0, 1.0)
-    t = (b * s + f) / ti.max(e, 1e-20)
-    if t < 0:
-        t, s = 0.0, ti.math.clamp(-c / ti.max(a, 1e-20), 0.0, 1.0)
-    elif t > 1:
-        t, s = 1.0, ti.math.clamp((b - c) / ti.max(a, 1e-20), 0.0, 1.0)
-    return s, t
