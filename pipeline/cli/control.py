@@ -69,7 +69,7 @@ def resume(job: str, output: Path, options: QueueOptions) -> None:
     """
     from pipeline.job.loading import job_of_text, load_job
     from pipeline.record.interrupted_recording import complete_interrupted_recording
-    from pipeline.run.goal import read_goal, what_is_made
+    from pipeline.run.goal import read_goal
 
     queue, name = place(job, output)
     waiting = queue.find(name)
@@ -84,7 +84,9 @@ def resume(job: str, output: Path, options: QueueOptions) -> None:
     until = read_goal(layout) if waiting is None else waiting.until
     state = look_at(submitted, layout, until)
     if is_finished(state, layout, None, until):
-        click.echo(f"up to date: {what_is_made(layout)}")
+        from pipeline.queue.endings import say_finished
+
+        say_finished(layout)
         return
     sys.exit(run(submitted, layout, stages_to_run(state), options=options, paused=waiting, until=until))
 

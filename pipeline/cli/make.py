@@ -156,7 +156,6 @@ def submit(
     """
     from pipeline.job.loading import read_job
     from pipeline.record.interrupted_recording import complete_interrupted_recording
-    from pipeline.run.goal import what_is_made
 
     if job_file.name == "job.toml" and (sentence := complete_interrupted_recording(JobLayout(job_file.parent))):
         click.echo(sentence, err=True)
@@ -176,7 +175,9 @@ def submit(
         if state is not None:
             say_what_it_takes(state, size_of(loaded.job, findings), layout, options.reserve_bytes)
     if is_finished(state, layout, loaded.text, until):
-        click.echo(f"up to date: {what_is_made(layout)}")
+        from pipeline.queue.endings import say_finished
+
+        say_finished(layout)
         return
     sys.exit(run(loaded.job, layout, todo, submitted=loaded, options=options, until=until))
 

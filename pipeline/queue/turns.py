@@ -6,7 +6,6 @@ from pathlib import Path
 
 import click
 
-from pipeline.base import wording
 from pipeline.base.errors import DiskFullError, JobBusyError, PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
@@ -15,21 +14,20 @@ from pipeline.base.wording import print_warnings
 from pipeline.job.loading import job_of_text, load_job
 from pipeline.model.gpus import own_gpus, render_trouble, usable_gpus
 from pipeline.model.job import Job
+from pipeline.queue.endings import tell_end
 from pipeline.queue.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
 from pipeline.queue.following import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob, QueueError
 from pipeline.queue.notifications import notification_of, send
 from pipeline.queue.preview_movie import PreviewMovie
-from pipeline.queue.states import ending_of
 from pipeline.run.checked_job import needs_pictures
 from pipeline.run.control import RunControl, Selection
 from pipeline.run.events import JobOutcome, Observer, Outcome
 from pipeline.run.executors.attempt import STAGES_REFERENCE
 from pipeline.run.executors.choice import ExecutorChoice, open_machines
-from pipeline.run.goal import read_goal, what_is_made
 from pipeline.run.progress import ProgressObserver, open_display
 from pipeline.run.runner import run_job
-from pipeline.run.solver_numbers import SolverWatch, simulation_numbers
+from pipeline.run.solver_numbers import SolverWatch
 from sim.core.runtime import cuda_gpus
 
 GPU_TASKS = 1
@@ -128,7 +126,7 @@ class Turns:
         """Say how a turn ended, here and to those who want to be told."""
         if ended.outcome is not None and self._job is not None:
             try:
-                _report(self._job, as_given(JobLayout(folder)), ended.outcome, aside=self._aside)
+                tell_end(self._job, as_given(JobLayout(folder)), ended.outcome, aside=self._aside)
             except (OSError, PipelineError) as error:  # of its folder: the other jobs go on
                 print_warnings([f"{name}: {error}"])
         notification = notification_of(name, folder, ended)
@@ -152,7 +150,7 @@ def run_now(queue: JobQueue, layout: JobLayout, job: Job, entry: QueuedJob) -> i
         outcome = _run_once(job, layout, replace(entry, settings=()))  # no cluster is needed for nothing
     except JobBusyError:
         return None
-    _report(job, layout, outcome)
+    tell_end(job, layout, outcome)
     if outcome.kind is JobOutcome.SUCCEEDED and queue.folder.exists():
         with queue.locked(), suppress(QueueError):
             old = queue.find(entry.name)
@@ -206,43 +204,6 @@ def _run_once(
             capacity=machines.capacity,
             machine=machines.machine,
         )
-
-
-def _report(job: Job, layout: JobLayout, outcome: Outcome, *, aside: bool = False) -> None:
-    """Say how a run ended; of a job that is not this command's own, on standard error."""
-    film = layout.path(layout.movie(job.movie.suffix))
-    if outcome.kind is not JobOutcome.SUCCEEDED:
-        how = f"{ending_of(outcome.kind)} after {wording.duration(outcome.seconds)}"
-        click.secho(f"{job.name}: {how}", err=True, fg="red")
-        for failed in outcome.failures[:5]:
-            click.echo(f"  {failed.task_id}: {failed.message}", err=True)
-            click.echo(f"    pipeline explain {layout.root} {failed.task_id} --log", err=True)
-        click.echo(f"continue with: pipeline resume {layout.root}", err=True)
-    elif outcome.ran == 0:
-        click.echo(f"up to date: {what_is_made(layout)}", err=aside)
-    elif read_goal(layout):
-        click.echo(f"{what_is_made(layout)}: done in {wording.duration(outcome.seconds)}", err=aside)
-    else:
-        click.echo(
-            f"{film}: {job.frame_count} frames, {job.frame_count / (job.movie.playback_fps or job.fps):.3g} s of film, "
-            f"in {wording.duration(outcome.seconds)}",
-            err=aside,
-        )
-    if outcome.ran or outcome.failures:
-        print_warnings([str(each) for each in simulation_numbers(layout).warnings()])
-        _write_report(layout)
-
-
-def _write_report(layout: JobLayout) -> None:
-    """Leave the report in the job's folder. That it cannot be written is said, and changes nothing about the run."""
-    from pipeline.show.report.page import write_report
-
-    try:
-        write_report([layout], layout.report)
-    except (OSError, PipelineError) as error:
-        print_warnings([f"no report was written: {error}"])
-    else:
-        click.echo(f"report: {layout.report}", err=True)
 
 
 def _hand_over(queue: JobQueue) -> None:
