@@ -215,10 +215,10 @@ class _Round:
 
     def afterwards(self) -> list[str]:
         """What a finished job still has to show: that there is nothing to do."""
-        broken = []
+        broken, before = [], len(self._studio.printed())
         again = self._family.adopt(self._studio.submit())
         again.returncode = self._family.wait(again.pid, PATIENCE_S)
-        if again.returncode != 0 or "up to date" not in self._studio.printed().splitlines()[-1]:
+        if again.returncode != 0 or not self._studio.printed()[before:].startswith("up to date"):
             broken.append(f"a finished job has something to do; submitted again it ends with {again.returncode}")
         return broken
 
