@@ -32,6 +32,8 @@ PYTHON
 )
 
 declare -A job # SLURM's number of each stage
+# Where SLURM refuses one, by a limit of the account's, those before it would make half a film.
+trap '[ -z "${job[*]}" ] || { scancel ${job[*]}; echo "the jobs before it are cancelled" >&2; }' ERR
 while IFS='|' read -r stage needs options chunks; do
     read -ra options <<<"$options"
     read -ra chunks <<<"$chunks"

@@ -21,13 +21,14 @@ from dask_processes import free_port
 from films import SPLASH, Studio, finish, stage_of
 from needed_blender import needs_bpy
 from processes_seen import lives
-from slurm_cluster import DEVICES, GPU_NODE, SlurmCluster, slurm_cluster, why_not
+from slurm_cluster import DEVICES, FILMS, GPU_NODE, SMALL, SlurmCluster, slurm_cluster, why_no_accounts, why_not
 
 from pipeline.base.task import Resources
 from pipeline.run.executors.choice import scheduler_address
 from pipeline.run.executors.dask import DaskExecutor
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(why_not()), reason=why_not()), needs_bpy]
+needs_accounts = pytest.mark.skipif(bool(why_no_accounts()), reason=why_no_accounts())
 
 OPENJD = Path(sys.executable).with_name("openjd")
 CPU = ("--set", "device=cpu", "--set", "render.device=cpu")
@@ -112,8 +113,13 @@ class Way:
 class StageArrays(Way):
     """`cluster/stages.sh`: a job for each stage, an array where frames are independent."""
 
+    options: tuple[str, ...] = ROOM
+    jobs: tuple[str, ...] = ()
+    """Those submitted last."""
+
     def begin(self) -> None:
-        self.cluster.run("cluster/stages.sh", self.film.layout.root, *ROOM, PIPELINE_CHUNK="3")
+        submitted = self.cluster.run("cluster/stages.sh", self.film.layout.root, *self.options, PIPELINE_CHUNK="3")
+        self.jobs = tuple(re.findall(r": job (\d+)", submitted))
 
 
 class OpenJobDescription(Way):
@@ -258,6 +264,50 @@ def test_a_film_on_slurm_is_the_same_whatever_happens(
         assert again == [stage] or (again == [] and stage == "render")
     if happens in (is_warned, is_out_of_time) and stage == "simulate":
         assert re.search(r"starting at frame [1-9]", cluster.printed())
+
+
+@needs_accounts
+@pytest.mark.nightly
+def test_the_accounts_tell_that_each_stage_is_done(cluster: SlurmCluster, reference: Studio, tmp_path: Path) -> None:
+    making = StageArrays(cluster, Studio.open(tmp_path, JOB))
+    making.options = (*ROOM, f"--account={FILMS}")
+    making.begin()
+    making.finish()
+    making.film.assert_whole(like=reference)
+    stages = ("bodies", "movie", "render", "render", "simulate", "surface", "surface")
+    done = [f"pipeline-{stage}|{FILMS}|COMPLETED" for stage in stages]
+    cluster.wait(lambda: cluster.booked(making.jobs) == done, "the accounts never tell it")
+
+
+@needs_accounts
+@pytest.mark.parametrize(("account", "words"), [("unknown", "Invalid account"), (SMALL, "job submit limit")])
+def test_what_slurm_refuses_leaves_nothing_behind(
+    cluster: SlurmCluster, tmp_path: Path, account: str, words: str
+) -> None:
+    making = StageArrays(cluster, Studio.open(tmp_path, JOB))
+    making.options = (*ROOM, f"--account={account}", "--hold")
+    with pytest.raises(AssertionError, match=words):
+        making.begin()
+    assert cluster.active() == set()
+
+
+@needs_accounts
+@pytest.mark.nightly
+def test_a_stage_without_enough_memory_goes_on_with_more(
+    cluster: SlurmCluster, reference: Studio, tmp_path: Path
+) -> None:
+    """Frames of Blender's need some 360 MB, all before them less."""
+    making = StageArrays(cluster, Studio.open(tmp_path, JOB))
+    making.options = ("--cpus-per-task=1", "--mem=300M")
+    making.begin()
+    making.wait_for_end()
+    assert "exceeded memory limit" in cluster.printed()
+    done = making.film.mtimes_ns()
+    making.options = ROOM
+    making.begin()
+    making.finish()
+    making.film.assert_whole(like=reference)
+    assert done.items() <= making.film.mtimes_ns().items()
 
 
 def test_workers_by_the_template_for_gpus_offer_one_each(cluster: SlurmCluster, tmp_path: Path) -> None:

@@ -1,12 +1,16 @@
-"""A SLURM cluster of this machine alone, in a folder: Debian's munged, slurmctld, and a slurmd for each node."""
+"""A SLURM cluster of this machine alone, in a folder: Debian's munged, slurmctld, and a slurmd for each node.
+
+Where slurmdbd and MariaDB are installed it has accounts too, as real sites have.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -16,6 +20,7 @@ from farm_processes import wait_until
 from places import PROJECT
 
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
+ACCOUNTANTS = ("slurmdbd", "mariadbd", "mariadb-install-db", "my_print_defaults")
 PATH = os.pathsep.join([os.environ["PATH"], "/usr/sbin"])
 NODES = ("node1", "node2", "node3")
 GPU_NODE = NODES[-1]
@@ -51,16 +56,50 @@ PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 """Nothing leaves the machine. A job that SLURM takes back begins again after `cred_expire` seconds, 120 as a rule."""
 
+ACCOUNTING = """\
+AccountingStorageType=accounting_storage/slurmdbd
+AccountingStoragePort={port}
+AccountingStoragePass={folder}/munge.socket
+AccountingStorageEnforce=associations,limits,qos
+JobAcctGatherType=jobacct_gather/linux
+JobAcctGatherFrequency=1
+JobAcctGatherParams=OverMemoryKill
+"""
+"""Every second SLURM looks whether a job has more memory than it asked for, and ends it."""
+
+DATABASE = """\
+DbdHost=localhost
+DbdPort={port}
+CommunicationParameters=NoInAddrAny
+SlurmUser=root
+AuthInfo=socket={folder}/munge.socket
+PidFile={folder}/slurmdbd.pid
+StorageType=accounting_storage/mysql
+StorageUser=root
+"""
+
+FILMS, SMALL = "films", "small"
+"""The second is for three jobs, too few for a film."""
+
 ROOM = "CPUs=2 RealMemory=4000"
 """What each node offers, whatever the machine has."""
 
 
 def why_not() -> str:
     """Why no cluster can be started here; empty if one can."""
-    missing = [name for name in PROGRAMS if shutil.which(name, path=PATH) is None]
-    if missing:
-        return f"{', '.join(missing)} missing: apt-get install slurm-wlm munge"
+    if missing := _missing(PROGRAMS):
+        return f"{missing} missing: apt-get install slurm-wlm munge"
     return "" if os.geteuid() == 0 else "slurmd and the jobs of others need root"
+
+
+def why_no_accounts() -> str:
+    """Why a cluster has no accounts here; empty if it has."""
+    missing = _missing(ACCOUNTANTS)
+    return missing and f"{missing} missing: apt-get install slurmdbd mariadb-server-core mariadb-client-core"
+
+
+def _missing(programs: Iterable[str]) -> str:
+    return ", ".join(name for name in programs if shutil.which(name, path=PATH) is None)
 
 
 class SlurmCluster:
@@ -72,6 +111,7 @@ class SlurmCluster:
             **{name: value for name, value in os.environ.items() if not name.startswith("SLURM_")},
             "PATH": PATH,
             "SLURM_CONF": str(folder / "slurm.conf"),
+            "MYSQL_UNIX_PORT": str(folder / "mariadb.socket"),
             "SBATCH_OUTPUT": str(folder / "job-%j.out"),
             "PIPELINE_VENV": sys.prefix,
         }
@@ -117,6 +157,11 @@ class SlurmCluster:
         """Of all jobs, by their numbers; each task of an array has one."""
         lines = self.run("squeue", "--states=all", "--array", "--noheader", "--format=%A %T").splitlines()
         return {int(number): state for number, state in map(str.split, lines)}
+
+    def booked(self, jobs: Iterable[str]) -> list[str]:
+        """`name|account|state` of each, in order; each task of an array has one."""
+        options = ("--allocations", "--noheader", "--parsable2", "--format=JobName,Account,State")
+        return sorted(self.run("sacct", *options, f"--jobs={','.join(jobs)}").splitlines())
 
     def active(self) -> set[int]:
         """The jobs that run or wait."""
@@ -179,6 +224,11 @@ class SlurmCluster:
         return set(self.run("sinfo", "--noheader", "--Node", "--format=%T").split()) == {"idle"}
 
 
+def _is_served(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((HOST, port)) == 0
+
+
 @contextmanager
 def slurm_cluster(folder: Path) -> Iterator[SlurmCluster]:
     """A cluster whose nodes are idle; nothing of it lives on after the block."""
@@ -203,6 +253,22 @@ def slurm_cluster(folder: Path) -> Iterator[SlurmCluster]:
 
         start("munged", "--foreground", "--force", f"--socket={folder}/munge.socket", *files)
         wait_until((folder / "munge.socket").exists, "munged never came up")
+        if not why_no_accounts():
+            port = free_port()
+            with (folder / "slurm.conf").open("a") as configuration:
+                configuration.write(ACCOUNTING.format(folder=folder, port=port))
+            (folder / "slurmdbd.conf").write_text(DATABASE.format(folder=folder, port=port))
+            (folder / "slurmdbd.conf").chmod(0o600)
+            data = ("--no-defaults", "--user=root", f"--datadir={folder}/mariadb", "--innodb-log-file-size=8M")
+            daemons.callback(shutil.rmtree, folder / "mariadb")  # a hundred megabytes
+            cluster.run("mariadb-install-db", *data, "--skip-test-db")
+            start("mariadbd", *data, f"--socket={folder}/mariadb.socket", "--skip-networking")
+            wait_until((folder / "mariadb.socket").exists, "mariadbd never came up")
+            start("slurmdbd", "-D")
+            wait_until(lambda: _is_served(port), "slurmdbd never came up")
+            accounts = f"account {FILMS}", f"account {SMALL} MaxSubmitJobs=3", f"user root account={FILMS},{SMALL}"
+            for entity in ("cluster test", *accounts):
+                cluster.run("sacctmgr", "--immediate", "add", *entity.split())
         start("slurmctld", "-D")
         for name in NODES:
             start("slurmd", "-D", "-N", name)
