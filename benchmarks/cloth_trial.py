@@ -2,16 +2,20 @@
 
 What `benchmarks.cloth_gates` measures, before the solver of `sim.cloth` is written anew; it goes when that one stands.
 
-A substep moves node i by u_i. Threads of warp and weft are solved exactly (tridiagonal, XPBD after Macklin et al. 2016
-with one step a substep, Macklin et al. 2019), bends and shears by relaxation; contacts and springs beyond a limit push
-in Jacobi iterations. Then every pair that might meet is tested: with n the normal between the closest points at the
-start, both sides stay apart if min n.(x_a + u_a) - max n.(x_b + u_b) is positive at the end, as both are linear in
-time. What fails is pushed again, and after some rounds moved as one, in zones that only grow (Bridson et al. 2002), so
-that it ends: nodes with one displacement do not meet.
+A step moves node i by u_i. Threads of warp and weft are solved exactly (tridiagonal, XPBD after Macklin et al. 2016,
+once in a small step, Macklin et al. 2019) against the bodies that nodes lie on, and implicitly across the thread, where
+its tension is a stiffness; bends and shears by relaxation. Contacts and springs beyond a limit push in two Jacobi
+iterations, and threads are solved again. Then every pair that might meet is tested: with n the normal between the
+closest points at the start, both sides stay apart if min n.(x_a + u_a) - max n.(x_b + u_b) is positive at the end, as
+both are linear in time. What fails goes through further rounds.
+
+A substep is one step, but one that leaves a spring too long, or a pair that fails, is taken again with half the length.
+At the least length what fails moves as one, in zones that only grow (Bridson et al. 2002), so that it ends: nodes with
+one displacement do not meet.
 
 Pairs are listed for some substeps: those that get within the thickness if nodes go on as they do now, each at most a
 margin from there. A list holds as long as all nodes are that near to where they were foreseen, which is tested at the
-end of every substep; whatever is common to a pair's motion costs nothing.
+end of every step; whatever is common to a pair's motion costs nothing.
 """
 
 import math
@@ -41,8 +45,18 @@ THICKNESS, MARGIN, LEAST_GAP = 0.5, 0.1, 0.01
 """Distance that layers keep, how far nodes may get from where they were foreseen, and what contacts never go below, in
 edges."""
 
+NEAR, RATE = 0.1, 0.3
+"""Layers nearer than this, in edges, go apart by this part of what is missing in a step."""
+
 STRAIN_LIMIT = 0.02
 """Springs beyond this pull along with the contacts."""
+
+MOST_STRAIN, LITTLE_STRAIN, LEAST_PART = 0.04, 0.024, 0.125
+"""A step that leaves a spring beyond the first is taken again with half the length, down to this part of a substep;
+below the second the next is twice as long."""
+
+FULL_ROUNDS, ROUNDS = 4, 8
+"""Rounds for pairs that fail: first of contacts and threads, then, up to so many in all, of what fails alone."""
 
 SQUEEZED = 0.8
 """Cells with a shorter side or diagonal, in edges, count as bent."""
@@ -61,10 +75,9 @@ PATCH_PAIRS = 48
 FINER = 2.0**-22
 """Unit of summed corrections, in edges: integers, so that their order does not matter."""
 
-SCENES = ("ball", "funnel", "twist")
-
-TALLY = ("searches", "rounds", "zoned_substeps", "largest_zone", "unresolved", "contacts")
-"""What is counted in a frame: the largest zone in nodes, `unresolved` are pairs that held nodes are led through."""
+TALLY = ("steps", "back", "searches", "rounds", "zoned_steps", "largest_zone", "unresolved", "contacts")
+"""What is counted in a frame: `back` are steps that were taken again, which count as steps, too; the largest zone in
+nodes; `unresolved` are pairs that held nodes are led through."""
 
 vec3, vec4, ivec4 = ti.math.vec3, ti.math.vec4, ti.math.ivec4
 
@@ -87,25 +100,22 @@ class TrialSheet:
 
     Attributes:
         count: of listed pairs.
+        step_s: length of the last step, which kernels read in `dt`.
         tally: what happened since `begin_frame`, by name.
 
     Args:
-        scene: one of `SCENES`.
+        scene: "ball", "funnel" or "twist".
         n: nodes along a side, a power of two on a GPU.
         substeps: in a frame of 1/60 s.
         on_gpu: threads are solved by parallel cyclic reduction there, and one after the other by elimination elsewhere.
-        sweeps: solutions of all threads at a time.
-        rounds: of pushing before zones are joined.
         every: substeps that a list is meant for.
         room: of the list, in pairs a node.
     """
 
-    def __init__(
-        self, scene: str, n: int, *, substeps: int, on_gpu: bool, sweeps: int, rounds: int, every: int, room: int
-    ) -> None:
-        self.scene, self.n, self.on_gpu, self.sweeps, self.rounds, self.every = scene, n, on_gpu, sweeps, rounds, every
+    def __init__(self, scene: str, n: int, *, substeps: int, on_gpu: bool, every: int, room: int) -> None:
+        self.scene, self.n, self.on_gpu, self.every = scene, n, on_gpu, every
         self.h = SIDE / (n - 1)
-        self.dt = 1.0 / 60.0 / substeps
+        self.substep_s, self.dt = 1.0 / 60.0 / substeps, ti.field(ti.f32, ())
         self.thickness, self.margin, self.least_gap = THICKNESS * self.h, MARGIN * self.h, LEAST_GAP * self.h
         self.quantum, self.inverse_mass = FINER * self.h, 1.0 / (DENSITY * self.h**2)
         self.cell = 3.0 * self.h
@@ -116,11 +126,12 @@ class TrialSheet:
         self.patches_a_side = -(-n // self.patch)
         self.patches = self.patches_a_side**2
         self.lanes = 64 if on_gpu else 1
-        # Nodes: where they are, displacement of the substep, velocity; scratch; where and how the last search saw them.
-        self.x, self.u, self.v, self.scratch, self.seen, self.foreseen, self.start = (
-            ti.Vector.field(3, ti.f32, nodes) for _ in range(7)
+        # Nodes: where they are, displacement of the step, and what both were before it; scratch; where the last search
+        # saw them, and how they moved in a substep; normal of the body that holds each, and how far threads press there
+        self.x, self.u, self.kept_x, self.kept_u, self.scratch, self.seen, self.foreseen, self.start, self.block = (
+            ti.Vector.field(3, ti.f32, nodes) for _ in range(9)
         )
-        self.w = ti.field(ti.f32, nodes)
+        self.w, self.pressure = ti.field(ti.f32, nodes), ti.field(ti.f32, nodes)
         self.sums, self.pushes = ti.Vector.field(3, ti.i32, nodes), ti.field(ti.i32, nodes)
         self.multiplier = ti.field(ti.f32, (2, nodes))
         self.direction = ti.Vector.field(3, ti.f32, nodes)
@@ -142,25 +153,20 @@ class TrialSheet:
         # Zones: the least node of each, its momentum over the mass of a node, how many nodes, and one that is held.
         self.zone, self.zone_count, self.zone_held = (ti.field(ti.i32, nodes) for _ in range(3))
         self.zone_sum = ti.Vector.field(3, ti.i64, nodes)
-        # Counters: listed pairs, hashed cells, what failed, what was pushed, what changed, half of the widest way.
-        self.counter = ti.field(ti.i32, 6)
-        self.strayed = ti.field(ti.i32, 64)
+        # Counters: listed pairs, hashed cells, what failed, what was pushed, what changed, half of the widest way, how
+        # far nodes stray from where they were foreseen, in `quantum`, and the worst strain, in 1e-6.
+        self.counter = ti.field(ti.i32, 8)
+        self.strayed, self.strains = ti.field(ti.i32, 64), ti.field(ti.i32, 64)
         self.mean_sums, self.mean = ti.Vector.field(3, ti.i64, 64), ti.Vector.field(3, ti.f32, 1)
-        self.count, self._age, self._strayed, self._time = 0, every, 0.0, 0.0
+        inverse_mass = np.full((n, n), self.inverse_mass, dtype=np.float32)
+        if scene == "twist":
+            inverse_mass[:, [0, -1]] = 0.0
+        self.w.from_numpy(inverse_mass.ravel())
+        for field in (self.x, self.start):
+            field.from_numpy(start_of(scene, n))
+        self.count, self._age, self._part, self.step_s = 0, float(every), 1.0, self.substep_s
+        self._strayed = self._strain = self._time = 0.0
         self.tally: dict[str, int] = {}
-        self.reset()
-
-    def reset(self) -> None:
-        """Back to the start."""
-        start, inverse_mass = start_of(self.scene, self.n), np.full(self.nodes, self.inverse_mass, dtype=np.float32)
-        if self.scene == "twist":
-            inverse_mass.reshape(self.n, self.n)[:, [0, -1]] = 0.0
-        self.x.from_numpy(start)
-        self.start.from_numpy(start)
-        self.w.from_numpy(inverse_mass)
-        for field in (self.u, self.v, self.sums, self.pushes, self.multiplier):
-            field.fill(0)
-        self._age, self._strayed, self._time = self.every, 0.0, 0.0
         self.begin_frame()
 
     def begin_frame(self) -> None:
@@ -174,65 +180,94 @@ class TrialSheet:
     # --- the substep ------------------------------------------------------------------------------------------------
 
     def substep(self) -> None:
-        """Advance by `dt`."""
-        self.predict(self._time)
-        self._time += self.dt
+        """Advance by `substep_s`."""
+        left = 1.0
+        while left > 0:
+            time, before, part = self._time, self.step_s, self._part
+            self.tally["steps"] += 1
+            if self._step() or part == LEAST_PART:
+                left -= part
+                if self._strain < LITTLE_STRAIN and part < 1.0 and left % (2 * part) == 0:
+                    self._part = 2 * part
+            else:
+                self.tally["back"] += 1
+                self.x.copy_from(self.kept_x)
+                self.u.copy_from(self.kept_u)
+                self._time, self.step_s, self._part, self._strayed = time, before, 0.5 * part, math.inf
+
+    def _step(self) -> bool:
+        """Advance by a part of a substep; returns whether no spring is too long, and pairs are apart without zones."""
+        before, self.step_s = self.step_s, self._part * self.substep_s
+        self.dt[None] = self.step_s
+        self.predict(self._time, before)
+        self._time += self.step_s
         self.solve_threads()
         if self._age >= self.every or self._strayed > self.margin:
-            self._look(float(self.every))
-        self.touch(self.count)
+            self._look(self.every)
+        else:
+            self.touch(self.count)
         found = self._push()
         self.solve_threads()
-        self._push()
         for _ in range(3):  # pushed beyond what was foreseen: look at what is near these ways
             if self._strayed <= self.margin:
                 break
-            self._look(1.0)
-            self.touch(self.count)
+            self._look(self._part)
             found = self._push()
         self.tally["contacts"] = max(self.tally["contacts"], found)
-        self._keep_apart()
-        self._age += 1
+        are_apart = self._keep_apart()
+        if not are_apart and self._part == LEAST_PART:
+            self._move_as_one()
+        self._age += self._part
+        return are_apart and self._strain <= MOST_STRAIN
 
     def _push(self) -> int:
-        found, strayed = self.push(self.count, self._age)
+        found, strayed = self.push(self.count, self._age + self._part)
         self._strayed = strayed * self.quantum
         return int(found)
 
-    def _look(self, steps: float) -> None:
-        self.count, self._age = int(self.search(steps)), 0
+    def _look(self, substeps: float) -> None:
+        self.count, self._age = int(self.search(substeps, self._part)), 0.0
         self.tally["searches"] += 1
         if self.count > self.capacity:
             raise SystemExit(f"{self.count} pairs, room for {self.capacity}: give more --room")
+        self.touch(self.count)
 
-    def _keep_apart(self) -> None:
-        """Push, and at last move as one, until every pair is known not to cross."""
-        for number in range(self.rounds + 1):
-            failed, strayed = self.test(self.count, self._age, int(number < self.rounds))
-            self._strayed = strayed * self.quantum
+    def _test(self, *, gives: bool = False) -> int:
+        failed, strayed, strain = self.test(self.count, self._age + self._part, int(gives))
+        self._strayed, self._strain = strayed * self.quantum, 1e-6 * strain
+        return int(failed)
+
+    def _keep_apart(self) -> bool:
+        """Go through rounds until every pair is known not to cross; returns whether that is so."""
+        for number in range(ROUNDS + 1):
+            failed = self._test(gives=FULL_ROUNDS <= number < ROUNDS)
             if not failed and self._strayed <= self.margin:
-                return
-            if number < self.rounds:
+                return True
+            if number < ROUNDS:
                 self.tally["rounds"] += 1
                 if not failed:
-                    self._look(1.0)
-                    self.touch(self.count)
+                    self._look(self._part)
+                elif number < FULL_ROUNDS:
+                    self._push()
+                    self.solve_threads()
                 else:
                     self.push_again(self.count)
-        self.begin_zones()
-        self.tally["zoned_substeps"] += 1
+        return False
+
+    def _move_as_one(self) -> None:
+        """Join what fails in zones until no pair does."""
+        self.zone.from_numpy(np.arange(self.nodes, dtype=np.int32))
+        self.tally["zoned_steps"] += 1
         while True:
             grew = False
             while self.join(self.count):
                 grew = True
             self.move_zones()
-            failed, strayed = self.test(self.count, self._age, 0)
-            self._strayed = strayed * self.quantum
+            failed = self._test()
             if not failed:
                 if self._strayed <= self.margin:
                     break
-                self._look(1.0)
-                self.touch(self.count)
+                self._look(self._part)
             elif not grew:  # held nodes are led through each other
                 self.tally["unresolved"] += failed
                 break
@@ -242,7 +277,7 @@ class TrialSheet:
 
     @ti.func
     def keep_out(self, i):
-        """Lead a node out of the ball, the funnel or the floor, with friction."""
+        """Lead a node out of the ball, the funnel or the floor, which block it, with friction."""
         if self.w[i] > 0:
             p = self.x[i] + self.u[i]
             depth, n = 1.0, vec3(0, 0, 1)
@@ -262,10 +297,12 @@ class TrialSheet:
                     depth, n = above, vec3(0, 0, 1)
             if depth < 0:
                 self.u[i] -= depth * n
+                self.block[i] = n
                 slip = self.u[i] - self.u[i].dot(n) * n
                 length = slip.norm()
                 if length > 0:
-                    self.u[i] -= slip * ti.min(1.0, -FRICTION * depth / length)
+                    self.u[i] -= slip * ti.min(1.0, FRICTION * (self.pressure[i] - depth) / length)
+                self.pressure[i] = 0.0
 
     @ti.func
     def held(self, i, time):
@@ -289,22 +326,23 @@ class TrialSheet:
         d = self.x[j] + self.u[j] - self.x[i] - self.u[i]
         length, weight = d.norm(), self.w[i] + self.w[j]
         if weight > 0 and length > 1e-9:
-            s = (length - ti.sqrt(2.0) * self.h) / (weight + 1.0 / (SHEAR * self.dt**2)) / length
+            s = (length - ti.sqrt(2.0) * self.h) / (weight + 1.0 / (SHEAR * self.dt[None] ** 2)) / length
             self.u[i] += self.w[i] * s * d
             self.u[j] -= self.w[j] * s * d
 
     @ti.kernel
-    def predict(self, time: ti.f32):
-        """Where inertia, gravity, bends and shears lead."""
-        n, dt = ti.static(self.n), ti.static(self.dt)
+    def predict(self, time: ti.f32, before: ti.f32):
+        """Where inertia, gravity, bends and shears lead; the step before took `before`."""
+        n, dt = ti.static(self.n), self.dt[None]
         stiffness = ti.static(BEND / self.h**2)
         for i in range(self.nodes):
+            self.kept_x[i], self.kept_u[i] = self.x[i], self.u[i]
             self.x[i] += self.u[i]
-            self.v[i] = self.u[i] / dt
             if self.w[i] > 0:
-                self.u[i] = dt * self.v[i] * (1.0 - DRAG * dt) - vec3(0, 0, GRAVITY * dt**2)
+                self.u[i] = dt * (self.u[i] / before) * (1.0 - DRAG * dt) - vec3(0, 0, GRAVITY * dt**2)
             self.sums[i], self.pushes[i] = 0, 0
             self.multiplier[0, i], self.multiplier[1, i] = 0.0, 0.0
+            self.block[i], self.pressure[i] = vec3(0), 0.0
             self.keep_out(i)
             if self.w[i] == 0:
                 self.u[i] = self.held(i, time + dt)
@@ -339,12 +377,11 @@ class TrialSheet:
     @ti.kernel
     def solve_threads(self):
         """All threads of the warp, then of the weft."""
-        for _ in ti.static(range(self.sweeps)):
-            for along in ti.static((1, 0)):
-                if ti.static(self.on_gpu):
-                    self.reduce_threads(along)
-                else:
-                    self.eliminate_threads(along)
+        for along in ti.static((1, 0)):
+            if ti.static(self.on_gpu):
+                self.reduce_threads(along)
+            else:
+                self.eliminate_threads(along)
 
     @ti.func
     def node_of(self, thread, j, along: ti.template()):
@@ -354,100 +391,138 @@ class TrialSheet:
     def compliance(self, thread, length):
         """Of a spring over dt²; threads on the edge have half as much cloth."""
         of_edge = ti.select((thread == 0) | (thread == self.n - 1), 2.0, 1.0)
-        return of_edge * ti.select(length < self.h, SOFT_IN_COMPRESSION, 1.0) / (STRETCH * self.dt**2)
+        return of_edge * ti.select(length < self.h, SOFT_IN_COMPRESSION, 1.0) / (STRETCH * self.dt[None] ** 2)
+
+    @ti.func
+    def yields(self, i, d, e):
+        """d.w(I - b b^T)e: how far an impulse along e moves a node along d that a body with the normal b holds."""
+        b = self.block[i]
+        return self.w[i] * (d.dot(e) - d.dot(b) * b.dot(e))
+
+    @ti.func
+    def stiffness_across(self, along: ti.template(), i):
+        """w l / h of the spring after a node: what its tension does against moves across the thread."""
+        return self.inverse_mass * ti.max(0.0, self.multiplier[along, i]) / self.h
+
+    @ti.func
+    def change(self, i, impulse):
+        """Move a node by what its threads do to it; a body holds it, until they pull it away from there."""
+        inwards = impulse.dot(self.block[i])
+        if inwards < 0:
+            impulse -= inwards * self.block[i]
+            self.pressure[i] -= self.w[i] * inwards
+        elif inwards > 0:
+            self.block[i] = vec3(0)
+        self.u[i] += self.w[i] * impulse
 
     @ti.func
     def eliminate_threads(self, along: ti.template()):
-        """(w_j + w_j+1 + a) l_j - w_j n_j-1.n_j l_j-1 - w_j+1 n_j.n_j+1 l_j+1 = C_j - a L_j, by elimination."""
+        """Multipliers l by elimination: with W = w (I - b b^T), a the compliance and L the sum of earlier solutions,
+
+        n_j.(W_j + W_j+1) n_j l_j + a l_j - n_j.W_j n_j-1 l_j-1 - n_j.W_j+1 n_j+1 l_j+1 = C_j - a L_j.
+
+        What they do to a node across the thread, d_j, becomes e_j + g_j-1 (e_j - e_j-1) + g_j (e_j - e_j+1) = d_j, with
+        the stiffness g.
+        """
         n = ti.static(self.n)
         for thread in range(n):
-            i = self.node_of(thread, 0, along)
-            p, before, wi, diagonal, right = self.x[i] + self.u[i], vec3(0), self.w[i], 1.0, 0.0
+            before, diagonal, right = vec3(0), 1.0, 0.0
             for j in range(n - 1):
-                other = self.node_of(thread, j + 1, along)
-                p_other, w_other = self.x[other] + self.u[other], self.w[other]
-                d = p_other - p
+                i, other, k = self.node_of(thread, j, along), self.node_of(thread, j + 1, along), thread * n + j
+                d = self.x[other] + self.u[other] - self.x[i] - self.u[i]
                 length = ti.max(d.norm(), 1e-9)
                 direction, a = d / length, self.compliance(thread, length)
-                off = -wi * direction.dot(before)
-                k = thread * n + j
-                self.upper[k] = off / diagonal if j > 0 else 0.0
-                diagonal = wi + w_other + a - off * self.upper[k]
-                if diagonal == 0.0:  # between two held nodes
-                    diagonal = 1.0
+                off = -self.yields(i, direction, before)
+                self.upper[k] = off / diagonal
+                diagonal = a + self.yields(i, direction, direction) + self.yields(other, direction, direction)
+                diagonal -= off * self.upper[k]
                 right = (length - self.h - a * self.multiplier[along, i] - off * right) / diagonal
-                self.right[k], self.direction[k] = right, direction
-                p, wi, before, i = p_other, w_other, direction, other
-            after, n_after, factor = 0.0, vec3(0), 0.0
+                self.right[k], self.direction[k], before = right, direction, direction
+            after, n_after, stiff_after, carried, factor = 0.0, vec3(0), 0.0, vec3(0), 0.0
             for reverse in range(n):
                 j = n - 1 - reverse
                 i, k = self.node_of(thread, j, along), thread * n + j
-                own, direction = 0.0, vec3(0)
-                if j < n - 1:
-                    own, direction = self.right[k] - factor * after, self.direction[k]
-                    factor = self.upper[k]
-                    other = self.node_of(thread, j + 1, along)
-                    self.u[other] += self.w[other] * (after * n_after - own * direction)
-                    self.multiplier[along, i] += own
-                if j == 0:
-                    self.u[i] += self.w[i] * own * direction
-                after, n_after = own, direction
+                own, direction, stiff = 0.0, vec3(0), 0.0
+                if j > 0:
+                    own, direction = self.right[k - 1] - self.upper[k] * after, self.direction[k - 1]
+                    other = self.node_of(thread, j - 1, along)
+                    self.multiplier[along, other] += own
+                    stiff = self.stiffness_across(along, other)
+                impulse, tangent = after * n_after - own * direction, (n_after + direction).normalized(1e-9)
+                self.scratch[k] = impulse.dot(tangent) * tangent
+                free = ti.select(self.w[i] == 0, 0.0, 1.0)
+                pivot = 1.0 + stiff_after * (1.0 - factor) + stiff
+                carried = free * (impulse - self.scratch[k] + stiff_after * carried) / pivot
+                factor = free * stiff / pivot
+                self.upper[k], self.direction[k] = factor, carried
+                after, n_after, stiff_after = own, direction, stiff
+            across = vec3(0)
+            for j in range(n):
+                k = thread * n + j
+                across = self.direction[k] + self.upper[k] * across
+                self.change(self.node_of(thread, j, along), self.scratch[k] + across)
 
     @ti.func
     def reduce_threads(self, along: ti.template()):
-        """The same by parallel cyclic reduction, a block a thread."""
+        """The same by parallel cyclic reduction, a block of the GPU for each thread of the sheet."""
         n = ti.static(self.n)
         ti.loop_config(block_dim=self.n)
         for g in range(self.nodes):
             thread, j = g // n, g % n
-            i = self.node_of(thread, j, along)
-            sx, sy = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
-            sz, sa = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
-            sb, sc = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
-            sr = ti.simt.block.SharedArray((self.n,), ti.f32)
-            p, wi = self.x[i] + self.u[i], self.w[i]
-            sx[j], sy[j], sz[j], sc[j] = p.x, p.y, p.z, wi
-            ti.simt.block.sync()
-            d, w_other = vec3(0), 0.0
-            if j < n - 1:
-                d, w_other = vec3(sx[j + 1], sy[j + 1], sz[j + 1]) - p, sc[j + 1]
+            i, other = self.node_of(thread, j, along), self.node_of(thread, ti.min(j + 1, n - 1), along)
+            sa, sb = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
+            sc, sx = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
+            sy, sz = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
+            d = self.x[other] + self.u[other] - self.x[i] - self.u[i]
             length = ti.max(d.norm(), 1e-9)
-            direction = d / length
-            ti.simt.block.sync()
+            direction, before = d / length, vec3(0)
             sx[j], sy[j], sz[j] = direction.x, direction.y, direction.z
             ti.simt.block.sync()
-            a, b, c, r = 0.0, 1.0, 0.0, 0.0
-            if j < n - 1 and wi + w_other > 0:
-                compliance = self.compliance(thread, length)
-                b, r = wi + w_other + compliance, length - self.h - compliance * self.multiplier[along, i]
-                if j > 0:
-                    a = -wi * direction.dot(vec3(sx[j - 1], sy[j - 1], sz[j - 1]))
-                if j < n - 2:
-                    c = -w_other * direction.dot(vec3(sx[j + 1], sy[j + 1], sz[j + 1]))
-            s = 1
-            while s < n:
-                sa[j], sb[j], sc[j], sr[j] = a, b, c, r
-                ti.simt.block.sync()
-                if j - s >= 0:
-                    f = -a / sb[j - s]
-                    b, r, a = b + f * sc[j - s], r + f * sr[j - s], f * sa[j - s]
-                else:
-                    a = 0.0
-                if j + s < n:
-                    f = -c / sb[j + s]
-                    b, r, c = b + f * sa[j + s], r + f * sr[j + s], f * sc[j + s]
-                else:
-                    c = 0.0
-                ti.simt.block.sync()
-                s *= 2
-            own = r / b if j < n - 1 else 0.0
-            self.multiplier[along, i] += own
-            sr[j] = own
-            ti.simt.block.sync()
-            change = own * direction
             if j > 0:
-                change -= sr[j - 1] * vec3(sx[j - 1], sy[j - 1], sz[j - 1])
-            self.u[i] += wi * change
+                before = vec3(sx[j - 1], sy[j - 1], sz[j - 1])
+            a, b, c, r = 0.0, 1.0, 0.0, 0.0
+            if j < n - 1:
+                compliance = self.compliance(thread, length)
+                a = -self.yields(i, direction, before)
+                b = compliance + self.yields(i, direction, direction) + self.yields(other, direction, direction)
+                c = -self.yields(other, direction, vec3(sx[j + 1], sy[j + 1], sz[j + 1]))
+                r = length - self.h - compliance * self.multiplier[along, i]
+            own = self.reduce(j, a, b, c, vec3(r, 0, 0), (sa, sb, sc, sx, sy, sz)).x
+            self.multiplier[along, i] += own
+            stiff, own_before, stiff_before = self.stiffness_across(along, i), 0.0, 0.0
+            sa[j], sb[j] = own, stiff
+            ti.simt.block.sync()
+            if j > 0:
+                own_before, stiff_before = sa[j - 1], sb[j - 1]
+            impulse, tangent = own * direction - own_before * before, (direction + before).normalized(1e-9)
+            along_thread = impulse.dot(tangent) * tangent
+            a, b, c, across = 0.0, 1.0, 0.0, vec3(0)
+            if self.w[i] > 0:
+                a, b, c, across = -stiff_before, 1.0 + stiff_before + stiff, -stiff, impulse - along_thread
+            self.change(i, along_thread + self.reduce(j, a, b, c, across, (sa, sb, sc, sx, sy, sz)))
+
+    @ti.func
+    def reduce(self, j, a, b, c, e, shared: ti.template()):
+        """u of a_j u_j-1 + b_j u_j + c_j u_j+1 = e_j, a row for each thread of the block that has `shared`."""
+        sa, sb, sc, sx, sy, sz = shared
+        s = 1
+        ti.simt.block.sync()
+        while s < self.n:
+            sa[j], sb[j], sc[j], sx[j], sy[j], sz[j] = a, b, c, e.x, e.y, e.z
+            ti.simt.block.sync()
+            if j - s >= 0:
+                f = -a / sb[j - s]
+                b, e, a = b + f * sc[j - s], e + f * vec3(sx[j - s], sy[j - s], sz[j - s]), f * sa[j - s]
+            else:
+                a = 0.0
+            if j + s < self.n:
+                f = -c / sb[j + s]
+                b, e, c = b + f * sa[j + s], e + f * vec3(sx[j + s], sy[j + s], sz[j + s]), f * sc[j + s]
+            else:
+                c = 0.0
+            ti.simt.block.sync()
+            s *= 2
+        return e / b
 
     # --- the search -------------------------------------------------------------------------------------------------
 
@@ -549,16 +624,19 @@ class TrialSheet:
                             self.consider(ivec4(a, e, b, f), 1, most, steps)
 
     @ti.kernel
-    def search(self, steps: ti.f32) -> ti.i32:
-        """List the pairs that may get within the thickness in so many substeps; returns how many there are."""
+    def search(self, steps: ti.f32, part: ti.f32) -> ti.i32:
+        """List the pairs that may get within the thickness in so many substeps; returns how many there are.
+
+        What nodes do in a substep is foreseen from their displacement in a part of one.
+        """
         n, side, size = ti.static(self.n), ti.static(self.patches_a_side), ti.static(self.patch)
         wide = ti.static(0.5 * self.thickness + self.margin)
         for i in range(64):
             self.mean_sums[i] = 0
         for i in range(self.nodes):
-            self.seen[i], self.foreseen[i] = self.x[i], self.u[i]
+            self.seen[i], self.foreseen[i] = self.x[i], self.u[i] / part
             for k in ti.static(range(3)):
-                ti.atomic_add(self.mean_sums[i & 63][k], ti.cast(ti.round(self.u[i][k] / self.quantum), ti.i64))
+                ti.atomic_add(self.mean_sums[i & 63][k], ti.cast(ti.round(self.foreseen[i][k] / self.quantum), ti.i64))
         for _ in range(1):
             total = ti.Vector.zero(ti.i64, 3)
             for k in range(64):
@@ -573,12 +651,12 @@ class TrialSheet:
             low, high, mean = self.x[i], self.x[i], vec3(0)
             for k in ti.static(range(4)):
                 low, high = ti.min(low, self.x[corners[k]]), ti.max(high, self.x[corners[k]])
-                mean += 0.25 * self.u[corners[k]]
+                mean += 0.25 * self.foreseen[corners[k]]
             self.low[i], self.high[i], self.motion[i] = low, high, mean
             differs = 0.0
             for k in ti.static(range(4)):
-                differs = ti.max(differs, (self.u[corners[k]] - mean).norm_sqr())
-                ends = self.x[corners[k]] + steps * (self.u[corners[k]] - self.mean[0])
+                differs = ti.max(differs, (self.foreseen[corners[k]] - mean).norm_sqr())
+                ends = self.x[corners[k]] + steps * (self.foreseen[corners[k]] - self.mean[0])
                 low, high = ti.min(low, ends), ti.max(high, ends)
             self.spread[i] = ti.sqrt(differs)
             self.way_low[i], self.way_high[i] = low - wide, high + wide
@@ -676,8 +754,8 @@ class TrialSheet:
     def normal_of(self, j, steps):
         """Of a cell after so many substeps; zero if it is squeezed then."""
         n = ti.static(self.n)
-        p, q = self.x[j] + steps * self.u[j], self.x[j + 1] + steps * self.u[j + 1]
-        r, s = self.x[j + n] + steps * self.u[j + n], self.x[j + n + 1] + steps * self.u[j + n + 1]
+        p, q = self.x[j] + steps * self.foreseen[j], self.x[j + 1] + steps * self.foreseen[j + 1]
+        r, s = self.x[j + n] + steps * self.foreseen[j + n], self.x[j + n + 1] + steps * self.foreseen[j + n + 1]
         least = ti.min((q - p).norm(), (r - p).norm(), (s - p).norm(), (r - q).norm())
         return ti.select(least > SQUEEZED * self.h, 1.0, 0.0) * (s - p).cross(r - q).normalized(1e-12)
 
@@ -715,7 +793,9 @@ class TrialSheet:
         relative = k[0] * self.u[q[0]] + k[1] * self.u[q[1]] + k[2] * self.u[q[2]] + k[3] * self.u[q[3]]
         wanted = self.thickness
         if start < wanted:
-            wanted = start + ti.min(1.0, self.dt / RECOVERY_TIME_S) * (wanted - start)
+            wanted = start + ti.min(1.0, self.dt[None] / RECOVERY_TIME_S) * (wanted - start)
+            if start < NEAR * self.h:
+                wanted = ti.max(wanted, start + RATE * (NEAR * self.h - start))
         missing = wanted - start - relative.dot(n)
         if missing > 0:
             weight = 0.0
@@ -742,14 +822,12 @@ class TrialSheet:
             self.give(j, -self.w[j] * beyond / (weight * length) * d)
 
     @ti.kernel
-    def push(self, count: ti.i32, age: ti.i32) -> ti.types.vector(2, ti.i32):
+    def push(self, count: ti.i32, age: ti.f32) -> ti.types.vector(2, ti.i32):
         """Two iterations of contacts and limits; returns contacts, and how far nodes stray from where they were
         foreseen, in `quantum`."""
         n = ti.static(self.n)
         for i in range(self.nodes):
             self.keep_out(i)
-            if i < 64:
-                self.strayed[i] = 0
             if i == 0:
                 self.counter[3] = 0
         for _ in ti.static(range(2)):
@@ -764,7 +842,8 @@ class TrialSheet:
                 self.take(i)
                 self.keep_out(i)
         self.look_where_nodes_are(age)
-        return ti.Vector([self.counter[3], self.farthest()])
+        self.conclude()
+        return ti.Vector([self.counter[3], self.counter[6]])
 
     @ti.kernel
     def push_again(self, count: ti.i32):
@@ -780,17 +859,33 @@ class TrialSheet:
     @ti.func
     def look_where_nodes_are(self, age):
         for i in range(self.nodes):
-            off = (self.x[i] - self.seen[i] + self.u[i] - (age + 1.0) * self.foreseen[i]).norm()
+            off = (self.x[i] - self.seen[i] + self.u[i] - age * self.foreseen[i]).norm()
             strayed = ti.cast(ti.min(off / self.quantum, 2.0e9), ti.i32)
             if strayed > self.strayed[i & 63]:
                 ti.atomic_max(self.strayed[i & 63], strayed)
 
     @ti.func
-    def farthest(self):
-        most = 0
-        for k in range(64):
-            most = ti.max(most, self.strayed[k])
-        return most
+    def look_how_long_springs_are(self):
+        n = ti.static(self.n)
+        for i in range(self.nodes):
+            p, length = self.x[i] + self.u[i], 0.0
+            if i % n < n - 1:
+                length = (self.x[i + 1] + self.u[i + 1] - p).norm()
+            if i // n < n - 1:
+                length = ti.max(length, (self.x[i + n] + self.u[i + n] - p).norm())
+            strain = ti.cast(1e6 * ti.min(length / self.h - 1.0, 1e3), ti.i32)
+            if strain > self.strains[i & 63]:
+                ti.atomic_max(self.strains[i & 63], strain)
+
+    @ti.func
+    def conclude(self):
+        """Most of what was looked at, in one thread: a loop that is not within another runs in parallel on a GPU."""
+        for _ in range(1):
+            strayed, strain = 0, 0
+            for k in range(64):
+                strayed, strain = ti.max(strayed, self.strayed[k]), ti.max(strain, self.strains[k])
+                self.strayed[k], self.strains[k] = 0, 0
+            self.counter[6], self.counter[7] = strayed, strain
 
     @ti.func
     def gap(self, p):
@@ -816,13 +911,10 @@ class TrialSheet:
         return gap < ti.min(self.least_gap, start - 1e-3 * self.least_gap) and moved > 1e-2 * start
 
     @ti.kernel
-    def test(self, count: ti.i32, age: ti.i32, gives: ti.i32) -> ti.types.vector(2, ti.i32):
-        """How many pairs may cross, which get corrections if `gives`; how far nodes stray, in `quantum`."""
-        for i in range(self.nodes):
-            if i < 64:
-                self.strayed[i] = 0
-            if i == 0:
-                self.counter[2] = 0
+    def test(self, count: ti.i32, age: ti.f32, gives: ti.i32) -> ti.types.vector(3, ti.i32):
+        """How many pairs may cross, which get corrections if `gives`; how far nodes stray; the worst strain."""
+        for _ in range(1):
+            self.counter[2] = 0
         for p in range(count):
             gap, a, b = self.gap(p)
             if self.may_cross(p, gap):
@@ -834,22 +926,17 @@ class TrialSheet:
                     self.give(a, self.w[a] * missing * n)
                     self.give(b, -self.w[b] * missing * n)
         self.look_where_nodes_are(age)
-        return ti.Vector([self.counter[2], self.farthest()])
+        self.look_how_long_springs_are()
+        self.conclude()
+        return ti.Vector([self.counter[2], self.counter[6], self.counter[7]])
 
     # --- zones ------------------------------------------------------------------------------------------------------
 
     @ti.kernel
-    def begin_zones(self):
-        """Every node is a zone of its own."""
-        for i in range(self.nodes):
-            self.zone[i] = i
-
-    @ti.kernel
     def join(self, count: ti.i32) -> ti.i32:
         """Join the zones of pairs that may cross, a step; returns whether there is more to do."""
-        for i in range(self.nodes):
-            if i == 0:
-                self.counter[4] = 0
+        for _ in range(1):
+            self.counter[4] = 0
         for p in range(count):
             if self.may_cross(p, self.gap(p)[0]):
                 q = self.pair[p]
