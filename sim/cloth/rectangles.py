@@ -11,7 +11,7 @@ from sim.cloth.row_blocks import LANES, load_blocks, rectangle_of, row_blocks, s
 from sim.cloth.row_springs import bend_lines, solve_diagonals
 from sim.cloth.row_threads import solve_lines, straighten_lines
 from sim.cloth.sheet import Grid
-from sim.cloth.spring_convergence import count_unconverged_in_lines
+from sim.cloth.spring_convergence import measure_excess_in_lines
 from sim.cloth.springs import bend_share, diagonal_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
 from sim.core.reductions import runs_on_gpu
@@ -111,27 +111,26 @@ class RectangleSprings:
             straighten_lines(blocks, self._lines[axis], short)
         store_blocks(blocks, state.nodes, self._rectangle, short)
 
-    def count_unconverged(self, dt: float) -> int:
-        """Number of springs that have not converged right after `displace` (`spring_convergence`)."""
+    def excess(self, dt: float) -> tuple[float, int]:
+        """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
         state, columns, rows = self._state, self._grid.columns, self._grid.rows
         across = {ALONG_Y: (columns, columns, 1), ALONG_X: (rows, 1, columns)}
-        return sum(
-            int(
-                count_unconverged_in_lines(
-                    self._blocks,
-                    self._lines[axis],
-                    lines,
-                    self._rectangle.first,
-                    node_step,
-                    line_step,
-                    self._thread_stiffness[axis],
-                    self._steps[axis],
-                    state.nodes,
-                    dt * dt,
-                )
+        found = [
+            measure_excess_in_lines(
+                self._blocks,
+                self._lines[axis],
+                lines,
+                self._rectangle.first,
+                node_step,
+                line_step,
+                self._thread_stiffness[axis],
+                self._steps[axis],
+                state.nodes,
+                dt * dt,
             )
             for axis, (lines, node_step, line_step) in across.items()
-        )
+        ]
+        return max(float(largest) for largest, _ in found), sum(int(count) for _, count in found)
 
 
 def _fill(array: ti.Ndarray, values: NDArray[np.float64], padding: NDArray[np.float64]) -> None:

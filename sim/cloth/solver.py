@@ -14,7 +14,7 @@ from sim.cloth.explicit import ExplicitSprings
 from sim.cloth.load import NodeLoad
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.motion import finish_step, predict_displacement
-from sim.cloth.parameters import DEFAULT_SUBSTEPS, RUNAWAY_SPEED, ClothParameters, shared_conflicts
+from sim.cloth.parameters import DEFAULT_SUBSTEPS, MOST_REFINED, RUNAWAY_SPEED, ClothParameters, shared_conflicts
 from sim.cloth.pins import Pins
 from sim.cloth.rectangles import rectangles_in_rows
 from sim.cloth.row_air import RectangleAir
@@ -36,6 +36,10 @@ INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 
 LOST_DISTANCE = 10.0
 """Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
+
+REFINED_BEYOND, RESTORED_BELOW = 0.05, 0.01
+"""Excess of a spring [rest lengths] beyond which the next step is half as long, and below which it is twice as long
+again: the excess falls with the square of the step."""
 
 LIVE_KEYS = frozenset(
     (
@@ -120,6 +124,7 @@ class ClothSolver:
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
         self._time_s = 0.0
+        self._refinement = 1
         self._hold_pins()
 
     def add_contacts(self, contacts: ClothContacts) -> None:
@@ -201,6 +206,7 @@ class ClothSolver:
     def _adopt(self, parameters: tuple[ClothParameters, ...]) -> None:
         """Step with these parameters from now on."""
         self.parameters = parameters
+        self._refinement = 1 if parameters[0].substeps is not None else self._refinement
         self._take_parameters()
         self._pins.hold_anew()
         self._own_dt = self._largest_dt()
@@ -208,8 +214,12 @@ class ClothSolver:
     # --- the step ---------------------------------------------------------------------------------------------------
 
     def stable_dt(self) -> float:
-        """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear."""
-        dt = self._own_dt
+        """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear.
+
+        If no number of substeps is given, a fraction of that while springs are longer than their tension makes them:
+        what contacts push out and springs pull back in does not settle in long steps, and gains energy.
+        """
+        dt = self._own_dt / self._refinement
         for contacts in self.contacts:
             dt = contacts.stable_dt(self.state, dt)
         return dt
@@ -225,17 +235,25 @@ class ClothSolver:
         self._integrator.displace(dt)
         for contacts in self.contacts:
             contacts.resolve(self.state, dt)
+        self._refine(self._integrator.excess(dt))
         state = self.state
         finish_step(state.nodes, state.motion, state.position, state.limit, dt, self._is_short)
         if self.load is not None:
             self.load.take_off(state)
         self._time_s += dt
 
+    def _refine(self, excess: float) -> None:
+        """Shorten the next steps, or lengthen them, by how much too long a spring is [rest lengths]."""
+        if self.parameters[0].substeps is None:
+            if excess > REFINED_BEYOND:
+                self._refinement = min(2 * self._refinement, MOST_REFINED)
+            elif excess < RESTORED_BELOW:
+                self._refinement = max(self._refinement // 2, 1)
+
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
         self._time_s = time_s
         self._hold_pins()  # as `restore` does: both take their first step from what pins hold now
-        self._integrator.begin_frame()
         for contacts in self.contacts:
             contacts.begin_frame()
 
@@ -306,10 +324,10 @@ class ClothSolver:
         return snapshots
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """Where nodes are and how they move, and the time."""
+        """Where nodes are and how they move, the time, and into how many parts steps are divided."""
         state = self.state
         arrays = {name: getattr(state, name).to_numpy() for name in _STATE}
-        return {**arrays, "clock": np.array([self._time_s])}
+        return {**arrays, "clock": np.array([self._time_s, self._refinement])}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -317,7 +335,7 @@ class ClothSolver:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (1,)}
+        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (2,)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
@@ -326,6 +344,7 @@ class ClothSolver:
             getattr(self.state, name).from_numpy(np.ascontiguousarray(arrays[name], dtype=kind))
         self.state.place_displaced()
         self._time_s = float(arrays["clock"][0])
+        self._refinement = int(arrays["clock"][1]) if self.parameters[0].substeps is None else 1
         self._hold_pins()
 
     def diagnostics(self) -> Diagnostics:

@@ -20,40 +20,36 @@ rubber sheet does that a heavy ball falls into; a bag of water that hangs from f
 
 
 @func
-def is_unconverged(
+def excess_of(
     i: ti.i32, j: ti.i32, rest: ti.f32, stiffness: ti.f32, multiplier: ti.f32, nodes: Nodes, dt_squared: ti.f32
-) -> ti.i32:
-    """Whether |d| - rest + l/(k dt²) > `LARGEST_RESIDUAL` rest, for a spring of which one node at least is free."""
+) -> ti.f32:
+    """(|d| - rest + l/(k dt²)) / rest, nothing for a spring between two nodes that are held."""
     d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
         nodes.displacement[i] - nodes.displacement[j]
     )
-    excess = d.norm() - rest + multiplier / (stiffness * dt_squared)
-    return ti.cast(excess > LARGEST_RESIDUAL * rest and nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0, ti.i32)
+    excess = (d.norm() - rest + multiplier / (stiffness * dt_squared)) / rest
+    return ti.select(nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0, excess, 0.0)
 
 
 @kernel
-def count_unconverged(
+def measure_excess(
     springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32
-) -> ti.i32:
-    """Number of springs of threads in lists that have not converged."""
+) -> ti.math.vec2:
+    """Largest excess of springs of threads in lists, and how many have not converged."""
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    unconverged = 0
+    largest, unconverged = 0.0, 0.0
     for s in range(count):
-        unconverged += is_unconverged(
-            springs.nodes[2 * s],
-            springs.nodes[2 * s + 1],
-            springs.law[s][0],
-            springs.law[s][1],
-            multiplier[s],
-            nodes,
-            dt_squared,
-        )
-    return unconverged
+        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+        excess = excess_of(i, j, springs.law[s][0], springs.law[s][1], multiplier[s], nodes, dt_squared)
+        ti.atomic_max(largest, excess)
+        if excess > LARGEST_RESIDUAL:
+            unconverged += 1.0
+    return ti.math.vec2(largest, unconverged)
 
 
 @kernel
-def count_unconverged_in_lines(
+def measure_excess_in_lines(
     blocks: ti.template(),
     along: Lines,
     lines: ti.i32,
@@ -64,11 +60,11 @@ def count_unconverged_in_lines(
     rest: ti.f32,
     nodes: Nodes,
     dt_squared: ti.f32,
-) -> ti.i32:
-    """Number of springs of a rectangle's threads along one direction that have not converged.
+) -> ti.math.vec2:
+    """The same of a rectangle's threads along one direction.
 
     Args:
-        blocks: workspace right after the rectangle's step, with the multipliers; places as in `solve_lines`.
+        blocks: workspace after the rectangle's step, with the multipliers; places as in `solve_lines`.
         along: the lines.
         lines: how many there are.
         first_node: of the rectangle.
@@ -79,14 +75,16 @@ def count_unconverged_in_lines(
         dt_squared: [s²].
     """
     ti.loop_config(serialize=True)
-    unconverged = 0
+    largest, unconverged = 0.0, 0.0
     for line in range(lines):
         for k in range(along.length - 1):
             block = line // LANES + k * along.strips
             if along.is_turned:
                 block += blocks.turned
             i = first_node + line * line_step + k * node_step
-            unconverged += is_unconverged(
-                i, i + node_step, rest, stiffness[line], blocks.multiplier[block][line % LANES], nodes, dt_squared
-            )
-    return unconverged
+            multiplier = blocks.multiplier[block][line % LANES]
+            excess = excess_of(i, i + node_step, rest, stiffness[line], multiplier, nodes, dt_squared)
+            largest = ti.max(largest, excess)
+            if excess > LARGEST_RESIDUAL:
+                unconverged += 1.0
+    return ti.math.vec2(largest, unconverged)

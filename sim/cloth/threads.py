@@ -5,7 +5,7 @@ import taichi as ti
 
 from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, colour_bounds
-from sim.cloth.spring_convergence import count_unconverged
+from sim.cloth.spring_convergence import measure_excess
 from sim.cloth.state import ClothState
 from sim.core.bundles import func
 from sim.core.launch import kernel
@@ -63,10 +63,11 @@ class ThreadSolver:
         for colour in springs.first_colours:
             straighten_threads(springs.on_device, self._pieces, colour, state.nodes, state.motion, dt, self._work)
 
-    def count_unconverged(self, state: ClothState, dt: float) -> int:
-        """Number of springs that have not converged right after `straighten` (`spring_convergence`)."""
+    def excess(self, state: ClothState, dt: float) -> tuple[float, int]:
+        """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
         springs = self._springs
-        return int(count_unconverged(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt))
+        largest, count = measure_excess(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt)
+        return float(largest), int(count)
 
 
 @kernel

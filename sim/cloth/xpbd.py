@@ -41,7 +41,7 @@ class XPBDSprings:
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], *, iterations: int) -> None:
         self._state, self._springs, self._iterations = state, springs, iterations
         self._momentum = AngularMomentumCorrection(state)
-        self._unconverged, self._is_counted = 0, True
+        self._unconverged = 0
         self._rectangles = {
             number: RectangleSprings(state, grid, int(state.host.first_node[number]))
             for number, grid in rectangles_in_rows(state.host).items()
@@ -60,12 +60,15 @@ class XPBDSprings:
         for number, rectangle in self._rectangles.items():
             rectangle.take_parameters(cloths[number])
 
-    def begin_frame(self) -> None:
-        """Count springs that have not converged in the next step; once a frame, as it costs a good part of a sweep."""
-        self._unconverged, self._is_counted = 0, False
+    def excess(self, dt: float) -> float:
+        """By how much a spring of threads and edges is longer than its tension makes it, at most [rest lengths]."""
+        found = [threads.excess(self._state, dt) for threads in self._threads]
+        found += [rectangle.excess(dt) for rectangle in self._rectangles.values()]
+        self._unconverged = sum(count for _, count in found)
+        return max((largest for largest, _ in found), default=0.0)
 
     def diagnostics(self) -> Mapping[str, float]:
-        """`overlong_springs`: at the start of the frame, along the threads of rectangles and the edges of meshes."""
+        """`overlong_springs`: at the end of the frame, along the threads of rectangles and the edges of meshes."""
         return {"overlong_springs": float(self._unconverged)}
 
     def stable_dt(self) -> float:
@@ -106,13 +109,8 @@ class XPBDSprings:
                 threads.displace(self._state, dt, is_first=iteration == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
-            if not self._is_counted:
-                self._unconverged += threads.count_unconverged(self._state, dt)
         for rectangle in self._rectangles.values():
             rectangle.displace(dt, self._iterations)
-            if not self._is_counted:
-                self._unconverged += rectangle.count_unconverged(dt)
-        self._is_counted = True
         self._momentum.restore(dt)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:

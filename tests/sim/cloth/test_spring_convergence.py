@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
-from cloth_scenes import FRAMES_PER_SECOND, VACUUM, cloth, rectangle, solver_of
+from cloth_scenes import FRAMES_PER_SECOND, VACUUM, cloth, energy, rectangle, solver_of
+from contact_scenes import cloth_of, world_of
 from test_rectangles import by_lists
 
+from sim.cloth.parameters import DEFAULT_SUBSTEPS
 from sim.cloth.solver import ClothSolver
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -42,9 +44,11 @@ def test_soft_cloth_that_stretches_by_its_own_weight_has_no_overlong_springs():
         shear_stiffness=0.2,
         **VACUUM,
     )
-    numbers = after(solver_of(soft), 30).diagnostics()
+    solver = after(solver_of(soft), 30)
+    numbers = solver.diagnostics()
     assert numbers["max_strain"] > 1.0
     assert numbers["overlong_springs"] == 0
+    assert solver.stable_dt() == pytest.approx(1.0 / (FRAMES_PER_SECOND * DEFAULT_SUBSTEPS))
 
 
 def test_springs_between_pins_are_not_counted():
@@ -69,3 +73,39 @@ def test_rows_and_lists_count_the_same(taichi_cpu, monkeypatch):
         after(solver, 1)
         counts.append(solver.diagnostics()["overlong_springs"])
     assert counts[0] == counts[1] > 0.0
+
+
+def on_the_tip_of_a_cone(**keys):
+    """Cotton whose weight a few nodes have to bear, which fall on the tip."""
+    cone = {"shape": {"type": "cone", "radius": 0.1, "height": 0.3}, "position": (0.0, 0.0, 0.15)}
+    sheet = {"shape": rectangle((0.6, 0.6), (31, 31)), "position": (0.0, 0.0, 0.31)}
+    return world_of({**sheet, **keys}, bodies=[cone])
+
+
+def test_cloth_on_a_tip_gains_no_energy_and_does_not_stretch():
+    """In 20 substeps a frame, always, what the cone pushes out and threads pull back in ends in 45 times the energy."""
+    world = on_the_tip_of_a_cone()
+    solver = cloth_of(world)
+    start = energy(solver)
+    energies, strains, substeps = [], [], []
+    for _ in range(20):
+        substeps.append(world.advance_frame().substeps["cloth"])
+        energies.append(energy(solver))
+        strains.append(solver.diagnostics()["max_strain"])
+    assert max(energies) < 1.02 * start
+    assert max(strains) < 0.2
+    assert substeps[0] == DEFAULT_SUBSTEPS < max(substeps)
+
+
+def test_steps_that_were_shortened_stay_so_over_a_checkpoint_and_those_that_are_asked_for_stay_as_they_are():
+    world = on_the_tip_of_a_cone()
+    usual_dt = 1.0 / (FRAMES_PER_SECOND * DEFAULT_SUBSTEPS)
+    while cloth_of(world).stable_dt() > 0.6 * usual_dt:
+        assert world.frame < 20
+        world.advance_frame()
+    resumed, asked = on_the_tip_of_a_cone(), on_the_tip_of_a_cone(substeps=DEFAULT_SUBSTEPS)
+    for other in (resumed, asked):
+        other.restore(world.frame, world.checkpoint())
+    counts = [each.advance_frame().substeps["cloth"] for each in (world, resumed, asked)]
+    assert counts[0] == counts[1] > counts[2] == DEFAULT_SUBSTEPS
+    np.testing.assert_array_equal(cloth_of(resumed).state.positions(), cloth_of(world).state.positions())
