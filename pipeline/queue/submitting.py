@@ -209,7 +209,7 @@ def _make_folder(layout: JobLayout) -> None:
         layout.root.mkdir(parents=True, exist_ok=True)
         probe = layout.root / ".writable"
         probe.touch()
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another host may have looked at the same moment
     except OSError as error:
         if is_disk_full(error):
             raise DiskFullError.of(layout.root) from error

@@ -8,7 +8,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,7 +29,6 @@ PROGRESS_INTERVAL_S = 0.2
 """Shortest time between two reports of progress [s]."""
 
 
-@cache
 def load_stages(reference: str) -> Sequence[Stage]:
     """The stages that a reference `module:ATTRIBUTE` names."""
     module, _, attribute = reference.partition(":")

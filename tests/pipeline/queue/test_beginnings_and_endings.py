@@ -1,4 +1,4 @@
-"""What a command leaves when a job has ended: a report, and nothing of a runner that was killed while it wrote one."""
+"""What a submission makes sure of, and what a command leaves of a job that has ended, also by a killed runner."""
 
 import os
 import signal
@@ -11,6 +11,7 @@ from command_line import pipeline
 from places import PROJECT
 
 from pipeline.base.layout import JobLayout
+from pipeline.queue.submitting import _make_folder
 
 SCENE = """
 name = "small"
@@ -61,3 +62,17 @@ def test_what_a_runner_left_undone_that_was_killed_while_it_wrote_the_report_is_
     assert "renders/small/report.html" in again.stderr
     assert layout.report.exists()
     assert "report" not in pipeline(*command, *until).stderr
+
+
+def test_a_host_that_looks_at_the_same_moment_whether_the_folder_can_be_written_to_is_no_obstacle(
+    tmp_path, monkeypatch
+):
+    touch = Path.touch
+
+    def touched_and_removed(self: Path) -> None:
+        touch(self)
+        self.unlink()  # by the other host
+
+    monkeypatch.setattr(Path, "touch", touched_and_removed)
+    _make_folder(JobLayout(tmp_path / "film"))
+    assert [*(tmp_path / "film").iterdir()] == []
