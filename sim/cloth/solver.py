@@ -206,7 +206,6 @@ class ClothSolver:
     def _adopt(self, parameters: tuple[ClothParameters, ...]) -> None:
         """Step with these parameters from now on."""
         self.parameters = parameters
-        self._refinement = 1 if parameters[0].substeps is not None else self._refinement
         self._take_parameters()
         self._pins.hold_anew()
         self._own_dt = self._largest_dt()
@@ -219,7 +218,7 @@ class ClothSolver:
         If no number of substeps is given, a fraction of that while springs are longer than their tension makes them:
         what contacts push out and springs pull back in does not settle in long steps, and gains energy.
         """
-        dt = self._own_dt / self._refinement
+        dt = self._own_dt / (self._refinement if self.parameters[0].substeps is None else 1)
         for contacts in self.contacts:
             dt = contacts.stable_dt(self.state, dt)
         return dt
@@ -244,11 +243,10 @@ class ClothSolver:
 
     def _refine(self, excess: float) -> None:
         """Shorten the next steps, or lengthen them, by how much too long a spring is [rest lengths]."""
-        if self.parameters[0].substeps is None:
-            if excess > REFINED_BEYOND:
-                self._refinement = min(2 * self._refinement, MOST_REFINED)
-            elif excess < RESTORED_BELOW:
-                self._refinement = max(self._refinement // 2, 1)
+        if excess > REFINED_BEYOND:
+            self._refinement = min(2 * self._refinement, MOST_REFINED)
+        elif excess < RESTORED_BELOW:
+            self._refinement = max(self._refinement // 2, 1)
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
@@ -343,8 +341,7 @@ class ClothSolver:
         for name, kind in _STATE.items():
             getattr(self.state, name).from_numpy(np.ascontiguousarray(arrays[name], dtype=kind))
         self.state.place_displaced()
-        self._time_s = float(arrays["clock"][0])
-        self._refinement = int(arrays["clock"][1]) if self.parameters[0].substeps is None else 1
+        self._time_s, self._refinement = float(arrays["clock"][0]), int(arrays["clock"][1])
         self._hold_pins()
 
     def diagnostics(self) -> Diagnostics:
