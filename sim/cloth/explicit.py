@@ -22,13 +22,7 @@ class ExplicitSprings:
     node gathers its own in a fixed order.
     """
 
-    def __init__(
-        self,
-        state: ClothState,
-        springs: Sequence[DeviceSprings],
-        *,
-        iterations: int,  # noqa: ARG002  (the integrators' protocol)
-    ) -> None:
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
         self._state, self._springs = state, springs
         counts = [family.count for family in springs]
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
@@ -75,7 +69,7 @@ class ExplicitSprings:
             self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
         )
 
-    def displace(self, dt: float) -> None:
+    def displace(self, dt: float, sweeps: int) -> None:
         """Displacements follow from velocities alone."""
 
 

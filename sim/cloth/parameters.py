@@ -21,6 +21,9 @@ DEFAULT_SUBSTEPS = 20
 MOST_REFINED = 16
 """Into so many parts those are divided at most."""
 
+MOST_SWEEPS = 8
+"""Sweeps over the springs in a step, at most, where no `iterations` are asked for."""
+
 RUNAWAY_SPEED = 1.0e4
 """No cloth of a film moves at thirty times the speed of sound [m/s]."""
 
@@ -218,11 +221,12 @@ class ClothParameters(Parameters):
         description=f"Steps per frame [-]; if omitted {DEFAULT_SUBSTEPS}, and up to {MOST_REFINED} times as many while "
         "springs are longer than their tension makes them; for explicit as many as it takes to keep the energy.",
     )
-    iterations: Annotated[int, Field(ge=1, le=100)] = Field(
-        default=1,
-        description="Sweeps of xpbd over its springs in every step [-]. A sweep does not let every spring know of all "
-        "that hangs on it: cloth that hangs from single points, and any mesh, stretches too much there, by less with "
-        "each sweep and with the square of the step; a run warns of springs that get half too long by it.",
+    iterations: Annotated[int, Field(ge=1, le=100)] | None = Field(
+        default=None,
+        description="Sweeps of xpbd over its springs in every step [-]; if omitted as many as it takes for no spring to "
+        f"be longer than its tension makes it, up to {MOST_SWEEPS}. A sweep does not let every spring know of all that "
+        "hangs on it: cloth that hangs from single points, and any mesh, stretches too much there, by less with each "
+        "sweep and with the square of the step; a run warns of springs that get half too long by it.",
     )
 
     @model_validator(mode="before")
@@ -245,7 +249,7 @@ class ClothParameters(Parameters):
                 f"shear_stiffness is for rectangles; a mesh shears with 3/8 of its stretch_stiffness, "
                 f"{0.375 * self.stretch_stiffness:g} N/m; remove it"
             )
-        if self.integrator == "explicit" and self.iterations > 1:
+        if self.integrator == "explicit" and self.iterations is not None:
             raise ValueError(f'iterations = {self.iterations} has no meaning for integrator = "explicit"; remove it')
         for number, pin in enumerate(self.pin):
             for key in ("corner", "edge"):

@@ -68,8 +68,8 @@ class RectangleSprings:
         self._diagonal_stiffness = (cloth.shear_stiffness or 0.0) * diagonal_share(grid)
         self._bend_damping = cloth.bend_damping
 
-    def displace(self, dt: float, iterations: int) -> None:
-        """Bring the displacements of a step of dt [s] to where the springs let them go."""
+    def displace(self, dt: float, sweeps: int) -> None:
+        """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps."""
         state, grid, blocks, short = self._state, self._grid, self._blocks, self._is_short
         load_blocks(blocks, state.nodes, self._rectangle, short)
         for axis in (ALONG_X, ALONG_Y):
@@ -82,8 +82,8 @@ class RectangleSprings:
                 self._bend_damping / dt,
                 short,
             )
-        for iteration in range(iterations):
-            is_first = int(iteration == 0)
+        for sweep in range(sweeps):
+            is_first = int(sweep == 0)
             for parity in range(2):
                 solve_diagonals(
                     blocks,

@@ -6,7 +6,7 @@ from sim.cloth.bundles import Lines
 from sim.cloth.device_springs import TINY_LENGTH
 from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, turn_strip
 from sim.cloth.springs import SEGMENT_LENGTH
-from sim.cloth.threads import TURNED_EXPLICITLY
+from sim.cloth.threads import LEAST_ALIKE, STRAIGHTENED, TURNED_EXPLICITLY
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
 
@@ -82,13 +82,22 @@ def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, r
         multiplier = blocks.multiplier[a]
         inverse_length, factor = Block(0.0), Block(0.0)
         for at in range(LANES):
-            d_x = quantum * ti.cast(p_x[at] - q_x[at], ti.f32) + (a_x[at] - b_x[at])
-            d_y = quantum * ti.cast(p_y[at] - q_y[at], ti.f32) + (a_y[at] - b_y[at])
-            d_z = quantum * ti.cast(p_z[at] - q_z[at], ti.f32) + (a_z[at] - b_z[at])
+            s_x = quantum * ti.cast(p_x[at] - q_x[at], ti.f32)
+            s_y = quantum * ti.cast(p_y[at] - q_y[at], ti.f32)
+            s_z = quantum * ti.cast(p_z[at] - q_z[at], ti.f32)
+            d_x = s_x + (a_x[at] - b_x[at])
+            d_y = s_y + (a_y[at] - b_y[at])
+            d_z = s_z + (a_z[at] - b_z[at])
             length = ti.max(ti.sqrt(d_x * d_x + d_y * d_y + d_z * d_z), TINY_LENGTH)
+            start_length = ti.max(ti.sqrt(s_x * s_x + s_y * s_y + s_z * s_z), TINY_LENGTH)
             inverse = 1.0 / length
+            is_alike = s_x * d_x + s_y * d_y + s_z * d_z > LEAST_ALIKE * start_length * length
+            over = ti.select(is_alike, 1.0 / start_length, inverse)
+            m_x = over * ti.select(is_alike, s_x, d_x)
+            m_y = over * ti.select(is_alike, s_y, d_y)
+            m_z = over * ti.select(is_alike, s_z, d_z)
             before = ti.select(is_first, 0.0, multiplier[at])
-            coupling = -w_a[at] * inverse * (d_x * n_x[at] + d_y * n_y[at] + d_z * n_z[at])  # n is of the spring before
+            coupling = -w_a[at] * (m_x * n_x[at] + m_y * n_y[at] + m_z * n_z[at])  # n is of the spring before
             lower = coupling * inverse_pivot[at]
             pivot = 1.0 / (w_a[at] + w_b[at] + compliance[at] - coupling * lower)
             solved[at] = (rest - length - compliance[at] * before - coupling * solved[at]) * pivot
@@ -96,9 +105,9 @@ def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, r
             factor[at] = lower
             inverse_length[at] = inverse
             multiplier[at] = before
-            n_x[at] = inverse * d_x
-            n_y[at] = inverse * d_y
-            n_z[at] = inverse * d_z
+            n_x[at] = m_x
+            n_y[at] = m_y
+            n_z[at] = m_z
         blocks.n_x[a], blocks.n_y[a], blocks.n_z[a] = n_x, n_y, n_z
         blocks.change[a], blocks.factor[a], blocks.inverse_length[a] = solved, factor, inverse_length
         blocks.multiplier[a] = multiplier
@@ -127,7 +136,7 @@ def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, r
             multiplier[at] += own
             weight = ti.max(w_a[at] + w_b[at], LEAST_WEIGHT)
             excess = ti.max(-multiplier[at] * inverse_length[at] - TURNED_EXPLICITLY / weight, 0.0)
-            tension[at] = excess
+            tension[at] = STRAIGHTENED * excess
             largest[at] = ti.max(largest[at], excess)
         blocks.u_x[b], blocks.u_y[b], blocks.u_z[b] = b_x, b_y, b_z
         blocks.multiplier[a], blocks.tension[a] = multiplier, tension

@@ -14,7 +14,14 @@ from sim.cloth.explicit import ExplicitSprings
 from sim.cloth.load import NodeLoad
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.motion import finish_step, predict_displacement
-from sim.cloth.parameters import DEFAULT_SUBSTEPS, MOST_REFINED, RUNAWAY_SPEED, ClothParameters, shared_conflicts
+from sim.cloth.parameters import (
+    DEFAULT_SUBSTEPS,
+    MOST_REFINED,
+    MOST_SWEEPS,
+    RUNAWAY_SPEED,
+    ClothParameters,
+    shared_conflicts,
+)
 from sim.cloth.pins import Pins
 from sim.cloth.rectangles import rectangles_in_rows
 from sim.cloth.row_air import RectangleAir
@@ -38,8 +45,8 @@ LOST_DISTANCE = 10.0
 """Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
 
 REFINED_BEYOND, RESTORED_BELOW = 0.05, 0.01
-"""Excess of a spring [rest lengths] beyond which the next step is half as long, and below which it is twice as long
-again: the excess falls with the square of the step."""
+"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length, and below
+which it goes back: the excess falls with every sweep, and with the square of the step."""
 
 LIVE_KEYS = frozenset(
     (
@@ -112,7 +119,7 @@ class ClothSolver:
         apart = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
         families = joined_springs([springs_of(sheet) for sheet in sheets], host.first_node.tolist(), apart=apart)
         self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
-        self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, iterations=shared.iterations)
+        self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs)
         self._totals = ClothTotals(self.state, self._springs)
         self._frame_dt = 1.0 / frames_per_second
         self._is_short = is_short(self.state.vertex_count, NODE_NS)
@@ -124,7 +131,8 @@ class ClothSolver:
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
         self._time_s = 0.0
-        self._refinement = 1
+        self._sweeps = self._refinement = 1
+        self._excess = 0.0
         self._hold_pins()
 
     def add_contacts(self, contacts: ClothContacts) -> None:
@@ -215,8 +223,8 @@ class ClothSolver:
     def stable_dt(self) -> float:
         """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear.
 
-        If no number of substeps is given, a fraction of that while springs are longer than their tension makes them:
-        what contacts push out and springs pull back in does not settle in long steps, and gains energy.
+        If no number of substeps is given, a fraction of that while springs are longer than their tension makes them by
+        what contacts do: what these push out and springs pull back in does not settle in long steps, and gains energy.
         """
         dt = self._own_dt / (self._refinement if self.parameters[0].substeps is None else 1)
         for contacts in self.contacts:
@@ -231,22 +239,31 @@ class ClothSolver:
         self._integrator.accelerate(dt)
         self._predict(dt)
         self._pins.displace(self._time_s, dt)
-        self._integrator.displace(dt)
-        for contacts in self.contacts:
-            contacts.resolve(self.state, dt)
-        self._refine(self._integrator.excess(dt))
+        self._displace(dt)
         state = self.state
         finish_step(state.nodes, state.motion, state.position, state.limit, dt, self._is_short)
         if self.load is not None:
             self.load.take_off(state)
         self._time_s += dt
 
-    def _refine(self, excess: float) -> None:
-        """Shorten the next steps, or lengthen them, by how much too long a spring is [rest lengths]."""
-        if excess > REFINED_BEYOND:
+    def _displace(self, dt: float) -> None:
+        """Springs, then contacts; how many sweeps and how long steps take from here on, by how much too long springs
+        are [rest lengths], as they are left by each."""
+        integrator, sweeps = self._integrator, self.parameters[0].iterations
+        integrator.displace(dt, sweeps or self._sweeps)
+        is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
+        by_springs = integrator.excess(dt) if is_loose else 0.0
+        for contacts in self.contacts:
+            contacts.resolve(self.state, dt)
+        self._excess = integrator.excess(dt) if self.contacts or not is_loose else by_springs
+        if by_springs > REFINED_BEYOND and sweeps is None and self._sweeps < MOST_SWEEPS:
+            self._sweeps *= 2
+        elif is_loose and self._excess > REFINED_BEYOND:
             self._refinement = min(2 * self._refinement, MOST_REFINED)
-        elif excess < RESTORED_BELOW:
+        elif self._excess < RESTORED_BELOW:
             self._refinement = max(self._refinement // 2, 1)
+        if by_springs < RESTORED_BELOW:
+            self._sweeps = max(self._sweeps // 2, 1)
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
@@ -322,10 +339,10 @@ class ClothSolver:
         return snapshots
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """Where nodes are and how they move, the time, and into how many parts steps are divided."""
+        """Where nodes are and how they move; the time, how many sweeps steps take, how they are divided and why."""
         state = self.state
         arrays = {name: getattr(state, name).to_numpy() for name in _STATE}
-        return {**arrays, "clock": np.array([self._time_s, self._refinement])}
+        return {**arrays, "clock": np.array([self._time_s, self._sweeps, self._refinement, self._excess])}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -333,7 +350,7 @@ class ClothSolver:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (2,)}
+        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (4,)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
@@ -341,7 +358,8 @@ class ClothSolver:
         for name, kind in _STATE.items():
             getattr(self.state, name).from_numpy(np.ascontiguousarray(arrays[name], dtype=kind))
         self.state.place_displaced()
-        self._time_s, self._refinement = float(arrays["clock"][0]), int(arrays["clock"][1])
+        self._time_s, sweeps, refinement, self._excess = arrays["clock"].tolist()
+        self._sweeps, self._refinement = int(sweeps), int(refinement)
         self._hold_pins()
 
     def diagnostics(self) -> Diagnostics:

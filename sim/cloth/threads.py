@@ -11,8 +11,14 @@ from sim.core.bundles import func
 from sim.core.launch import kernel
 
 TURNED_EXPLICITLY = 0.15
-"""Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be that of the prediction. With fixed
-directions, waves across threads need dt² 4 T w / |d| <= 4/3, summed over the two threads of a node."""
+"""Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
+across threads need dt² 4 T w / |d| <= 4, summed over the two threads of a node."""
+
+STRAIGHTENED = 0.35
+"""Part of what is more that turns with the springs: waves are stable from 1/4 on, and neither damped nor driven."""
+
+LEAST_ALIKE = 0.995
+"""Cosine of the angle that a spring may turn by in a step for its direction to be that of the start."""
 
 
 class ThreadSolver:
@@ -22,9 +28,14 @@ class ThreadSolver:
     stiff rods", here without branches), which the Thomas algorithm solves in one pass forth and one back. A thread acts
     as a chain of pieces instead of one of springs, and stretches less by the length of a piece.
 
-    Directions are those of the prediction, so that tension pulls nodes back across the thread as an explicit force
-    does: beyond dt < |d| (m / 3 T |d|)^(1/2), about the time in which a wave passes a spring, that overshoots, and a
-    cloth that hangs from its corner would jitter there. `straighten` therefore lets tension turn with its springs.
+    Directions are those of the start, as in SHAKE (Ryckaert, Ciccotti & Berendsen 1977): then a swinging sheet keeps its
+    energy and its angular momentum, of which directions of the prediction take a part in every step. Springs that turn
+    far in a step, as where cloth buckles, push along the prediction, as nothing else leads to their length.
+
+    With fixed directions tension pulls nodes back across the thread as an explicit force does: beyond
+    dt < |d| (m / 2 T |d|)^(1/2), the time in which a wave passes a spring, that overshoots, and a cloth that hangs from
+    its corner would jitter there. `straighten` therefore lets a part of what is more turn with its springs, as in
+    Newmark's implicit scheme.
 
     What can be done spring by spring is; the passes along the pieces read nothing but a few numbers that lie together.
     On a GPU following the nodes there would take most of the step's time, as memory answers late. Kernels here and in
@@ -53,11 +64,11 @@ class ThreadSolver:
             solve_threads(springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work)
 
     def straighten(self, state: ClothState, dt: float) -> None:
-        """Let tension turn with its springs, where it is too strong for directions of the prediction.
+        """Let tension turn with its springs, where it is too strong for fixed directions.
 
-        The force of a spring changes across it by T/|d| times the displacement across it. With that, implicit Euler is
-        (M + dt² K) (u - u*) = M (u~ - u*) for displacements u~ of the fixed directions and u* of the prediction, where
-        K is the Laplacian of the thread with weights T/|d|. Only what exceeds `TURNED_EXPLICITLY` is in K.
+        The force of a spring changes across it by T/|d| times the displacement across it. Newmark's scheme takes it at
+        x + beta (u - u*) for displacements u and those of the prediction u*: (M + beta dt² K) (u - u*) = M (u~ - u*)
+        with u~ of the fixed directions, where K is the Laplacian of the thread with weights T/|d|.
         """
         springs = self._springs
         for colour in springs.first_colours:
@@ -79,7 +90,7 @@ def solve_threads(
         (w_s + w_s+1 + a) D_s - w_s n_s-1.n_s D_s-1 - w_s+1 n_s.n_s+1 D_s+1 = -C_s - a l_s,   a = 1/(k dt²)
 
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
-    of that. `tension` becomes what is too much of -l_s / |d|, `is_taut` whether a piece has any.
+    of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
     """
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     s0, s1, s2, s3, s4 = colour_bounds(pieces.spring_of_colour, first)
@@ -97,7 +108,11 @@ def solve_threads(
             if is_first:
                 work.multiplier[s] = 0.0
             work.tension[s] = 1.0 / length
+            at_start = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
+            start_length = ti.max(at_start.norm(), TINY_LENGTH)
             work.direction[s] = work.tension[s] * d
+            if at_start.dot(d) > LEAST_ALIKE * start_length * length:
+                work.direction[s] = at_start / start_length
             work.change[s] = springs.law[s][0] - length - compliance * work.multiplier[s]
             work.lower[s] = -nodes.inverse_mass[i]
             work.diagonal[s] = nodes.inverse_mass[i] + nodes.inverse_mass[j] + compliance
@@ -136,7 +151,7 @@ def solve_threads(
             weight = nodes.inverse_mass[i] + nodes.inverse_mass[j]
             excess = 0.0
             if stress * weight > TURNED_EXPLICITLY:
-                excess = stress - TURNED_EXPLICITLY / weight
+                excess = STRAIGHTENED * (stress - TURNED_EXPLICITLY / weight)
                 pieces.is_taut[pieces.piece[s]] = 1
             work.tension[s] = excess
 

@@ -30,16 +30,15 @@ class XPBDSprings:
     Approximate: one sweep a step does not let a stiff spring know of all that hangs on it. A spring alone, of a colour
     that comes early, stretches by 2 n g dt² more than it should if n nodes hang on it, whatever its stiffness; the last
     spring of a piece of thread by n g dt², and those within a piece by nothing. That falls with the square of the step,
-    and with every further sweep (`iterations`). Bend springs have one sweep always.
+    and with every further sweep. Bend springs have one sweep always.
 
     Args:
         state: what they move.
         springs: all springs.
-        iterations: sweeps over springs between two nodes in every step.
     """
 
-    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], *, iterations: int) -> None:
-        self._state, self._springs, self._iterations = state, springs, iterations
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
+        self._state, self._springs = state, springs
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
         self._rectangles = {
@@ -98,19 +97,19 @@ class XPBDSprings:
                     springs.arity,
                 )
 
-    def displace(self, dt: float) -> None:
-        """Bring the displacements of a step of dt [s] to where the springs let them go."""
+    def displace(self, dt: float, sweeps: int) -> None:
+        """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps."""
         for springs in self._bends:
             self._solve_bends(springs, dt)
-        for iteration in range(self._iterations):
+        for sweep in range(sweeps):
             for springs, multiplier in self._pairs:
-                self._solve_pairs(springs, multiplier, dt, is_first=iteration == 0)
+                self._solve_pairs(springs, multiplier, dt, is_first=sweep == 0)
             for threads in self._threads:
-                threads.displace(self._state, dt, is_first=iteration == 0)
+                threads.displace(self._state, dt, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
         for rectangle in self._rectangles.values():
-            rectangle.displace(dt, self._iterations)
+            rectangle.displace(dt, sweeps)
         self._momentum.restore(dt)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:

@@ -7,6 +7,7 @@ import pytest
 import taichi as ti
 import trimesh
 from cloth_scenes import (
+    FRAMES_PER_SECOND,
     GRAVITY,
     SOFT,
     UNDAMPED,
@@ -15,6 +16,7 @@ from cloth_scenes import (
     advance,
     angular_momentum,
     cloth,
+    energy,
     momentum,
     rectangle,
     solver_of,
@@ -69,7 +71,7 @@ def test_every_row_of_a_hanging_column_stretches_by_the_weight_below_it(integrat
 def test_xpbd_stretches_long_threads_more_than_they_should_by_what_is_said():
     """The last spring of a piece of thread by n g dt² for n nodes below it, as `XPBDSprings` tells, and no other."""
     rows = 101
-    solver = column(rows, "xpbd", 4000.0, substeps=DEFAULT_SUBSTEPS)
+    solver = column(rows, "xpbd", 4000.0, substeps=DEFAULT_SUBSTEPS, iterations=1)
     settle(solver, 10, 80)
     stiffness = 4000.0 * 0.05 * (rows - 1)
     weight = 0.15 * 0.05 * GRAVITY * (np.arange(rows - 1, 0, -1) - 0.5) / (rows - 1)
@@ -106,9 +108,9 @@ def test_a_mesh_hangs_as_far_down_as_its_stiffness_lets_it(tmp_path):
 
 
 def test_a_taut_strip_does_not_jitter_across():
-    """At 20 steps a frame waves run along its upper springs in half a step: directions of the prediction overshoot."""
+    """At 20 steps a frame waves run along its upper springs in half a step: fixed directions overshoot."""
     rows = 401
-    keys = {"mass_per_area": 0.15, "stretch_stiffness": 4000.0, **THREADS_ALONE, **VACUUM}
+    keys = {"mass_per_area": 0.15, "stretch_stiffness": 4000.0, "substeps": 20, **THREADS_ALONE, **VACUUM}
     strip = rectangle((0.05, 1.0), (2, rows))
     solver = solver_of(cloth(shape=strip, rotation_deg=(90, 0, 0), pin=[{"edge": "y+"}], **keys))
     settle(solver, 10, 20)
@@ -119,8 +121,8 @@ def test_a_taut_strip_does_not_jitter_across():
     for _ in range(60):
         solver.substep(solver.stable_dt())
     across = solver.state.velocity.to_numpy()[:, 1]
-    # The strip keeps a little of it as slow waves; without `straighten` nodes move at metres a second.
-    assert np.abs(across).max() < 1e-3
+    # The strip keeps it as waves; without `straighten` nodes move at 0.2 m/s.
+    assert np.abs(across).max() < 2e-3
 
 
 @pytest.mark.slow
@@ -138,6 +140,26 @@ def test_iterations_bring_springs_at_a_corner_to_what_short_steps_find():
     errors = {key: strain - strains[200, 1] for key, strain in strains.items()}
     assert 0.0 < errors[20, 1] < 0.05
     assert abs(errors[20, 4]) < 0.3 * errors[20, 1]
+
+
+@pytest.mark.parametrize("pins", [[{"edge": "x-"}], [{"corner": "x-y-"}, {"corner": "x-y+"}]], ids=["edge", "corners"])
+def test_an_undamped_sheet_that_swings_keeps_its_energy(pins):
+    """At the default steps, of m g L / 2, which is turned over, 95 % in a second; and it never has more than that.
+
+    With one sweep a step it has 1.6 times as much in between, as two corners are to hold 4,225 nodes; with springs that
+    push along their predicted directions 10 % are lost.
+    """
+    solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (65, 65)), pin=pins, **VACUUM, **UNDAMPED))
+    scale = solver.diagnostics()["mass"] * GRAVITY * 0.5
+    gained = []
+    for frame in range(60):
+        solver.begin_frame(frame / FRAMES_PER_SECOND)
+        for _ in range(DEFAULT_SUBSTEPS):
+            solver.substep(1.0 / (FRAMES_PER_SECOND * DEFAULT_SUBSTEPS))
+        gained.append(energy(solver) / scale)
+    assert max(gained) < 0.03
+    assert gained[-1] > -0.05
+    assert solver.diagnostics()["max_strain"] < 0.25
 
 
 @pytest.mark.slow
