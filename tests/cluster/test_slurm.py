@@ -216,9 +216,12 @@ def is_warned(way: Way, worker: psutil.Process) -> None:
             pytest.param(way, stage, happens, ends, marks=pytest.mark.nightly)
             for way, stage, happens, ends in [
                 (StageArrays, "render", is_killed, True),
+                (StageArrays, "render", is_cancelled, True),
+                (StageArrays, "simulate", is_cancelled, True),
                 (StageArrays, "simulate", loses_its_node, False),
                 (StageArrays, "simulate", has_its_node_drained, False),
                 (StageArrays, "simulate", is_out_of_time, False),
+                (StageArrays, "render", is_warned, False),
                 (OpenJobDescription, "render", is_killed, True),
                 (OpenJobDescription, "simulate", loses_its_node, False),
                 (OpenJobDescription, "simulate", has_its_node_drained, False),
@@ -264,6 +267,22 @@ def test_a_film_on_slurm_is_the_same_whatever_happens(
         assert again == [stage] or (again == [] and stage == "render")
     if happens in (is_warned, is_out_of_time) and stage == "simulate":
         assert re.search(r"starting at frame [1-9]", cluster.printed())
+
+
+@pytest.mark.parametrize("task", [0, 1])
+def test_a_task_of_an_array_that_is_out_of_time_begins_again_alone(
+    cluster: SlurmCluster, tmp_path: Path, task: int
+) -> None:
+    """The last one too, whose number is the array's."""
+    work = tmp_path / "work"
+    work.write_text("#!/bin/sh\necho begun\nexec sleep 600\n")
+    work.chmod(0o755)
+    command = ("cluster/stage-array.sbatch", tmp_path, "render", "0-2", "3-5")
+    array = cluster.sbatch(*ROOM, "--array=0-1", *command, PIPELINE_RUN=str(work))
+    cluster.wait(lambda: cluster.printed().count("begun") == 2, "the tasks never begin")
+    cluster.run("scancel", "--batch", "--signal=USR1", f"{array}_{task}")
+    cluster.wait(lambda: cluster.restarts(f"{array}_{task}") == 1, "SLURM never takes it back")
+    assert cluster.restarts(f"{array}_{1 - task}") == 0
 
 
 @needs_accounts

@@ -177,13 +177,22 @@ class SlurmCluster:
         }
 
     @staticmethod
-    def job_of(process: psutil.Process) -> int:
-        """The job that a process belongs to."""
-        return int(process.environ()["SLURM_JOB_ID"])
+    def job_of(process: psutil.Process) -> str:
+        """The job that a process belongs to, as `scancel` takes it: a task of an array by its place there.
 
-    def node_of(self, job: int) -> str:
+        By the number that such a task also has, `scancel` ends the whole array (the last one's), or nothing.
+        """
+        seen = process.environ()
+        task = seen.get("SLURM_ARRAY_TASK_ID")
+        return f"{seen['SLURM_ARRAY_JOB_ID']}_{task}" if task else seen["SLURM_JOB_ID"]
+
+    def node_of(self, job: int | str) -> str:
         """The node that a job runs on."""
         return self.run("squeue", f"--jobs={job}", "--noheader", "--format=%N")
+
+    def restarts(self, job: str) -> int:
+        """How many times SLURM took a job back to begin it again."""
+        return int(self.run("scontrol", "show", "--oneliner", "job", job).partition(" Restarts=")[2].split()[0])
 
     def gpus_of(self, job: int) -> set[str]:
         """The GPUs that processes of a job see, by their numbers."""
