@@ -10,15 +10,30 @@ for tag in "$@"; do
     case $tag in CPU=*) threads=${tag#CPU=} ;; esac
 done
 
-worker=
-trap 'trap "" TERM; [ -z "$worker" ] || kill -TERM "$worker" 2>/dev/null; wait; exit 0' TERM INT
-while true; do
-    # No nanny: what restarts it is this loop. No memory limit: Dask would see its own process only.
-    "$run" dask worker --scheduler-file "$shared/scheduler.json" --no-nanny --nthreads "$threads" \
-        --memory-limit 0 --resources "$*" --death-timeout 60 --no-dashboard &
-    worker=$!
-    wait "$worker"
-    worker=
-    sleep 5 &
+leave() { # tells the worker until it is gone: while it starts it does not listen
+    trap "" TERM
+    while jobs=$(jobs -rp) && [ -n "$jobs" ]; do
+        kill -TERM $jobs 2>/dev/null
+        sleep 1
+    done
+    exit 0
+}
+pause() {
+    sleep "$1" &
     wait $!
+}
+trap leave TERM INT
+while true; do
+    # Here, since Dask would not listen meanwhile.
+    until [ -e "$shared/scheduler.json" ]; do pause 1; done
+    # No nanny: what restarts it is this loop. No memory limit: Dask would see its own process only.
+    # SLURM tells the worker to leave and this script, which tells it, too: a second SIGTERM would end it at once, without
+    # the grace for its tasks. After the first Dask puts back what was there before, which is to ignore it.
+    (
+        trap "" TERM
+        exec "$run" dask worker --scheduler-file "$shared/scheduler.json" --no-nanny --nthreads "$threads" \
+            --memory-limit 0 --resources "$*" --death-timeout 60 --no-dashboard
+    ) &
+    wait $!
+    pause 5
 done

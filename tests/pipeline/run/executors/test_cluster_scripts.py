@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import psutil
 import pytest
 from dask_processes import HOST, free_port, running
+from distributed import Client, Worker, WorkerPlugin
+from farm_processes import wait_until
 from places import HELPERS, PROJECT
+from processes_seen import words_of
 from synthetic_jobs import contents, run_synthetic
 
 from pipeline.base.task import Resources
@@ -22,6 +28,8 @@ from pipeline.run.executors.inline import InlineExecutor
 
 CLUSTER = PROJECT / "cluster"
 PATIENCE_S = 90.0
+DEATH_TIMEOUT_S = 60.0
+"""After which a worker that finds no scheduler begins anew."""
 CERTIFICATE = (
     *("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=farm"),
     *("-addext", "keyUsage=digitalSignature,keyCertSign", "-keyout", "farm.key", "-out", "farm.pem"),
@@ -53,6 +61,11 @@ def start(script: str, environment: dict[str, str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen(["bash", str(CLUSTER / script)], env=environment, stdout=subprocess.DEVNULL)
 
 
+def start_worker(environment: dict[str, str], stderr: IO[bytes] | None = None) -> subprocess.Popen[bytes]:
+    command = ["bash", str(CLUSTER / "worker.sh"), "CPU=1", "MEM=2e9"]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=stderr)
+
+
 @pytest.fixture
 def scheduler(environment) -> Iterator[str]:
     with running(start("scheduler.sbatch", environment)):
@@ -74,6 +87,45 @@ def test_workers_offer_what_slurm_gives_and_leave_on_sigterm(tmp_path, environme
         workers.send_signal(signal.SIGTERM)
         assert workers.wait(PATIENCE_S) == 0
         assert psutil.wait_procs(family, PATIENCE_S)[1] == []
+
+
+class SlowPlugin(WorkerPlugin):
+    """Stands for tasks that write a checkpoint while their worker leaves."""
+
+    async def teardown(self, worker: Worker) -> None:  # noqa: ARG002 - the signature is Dask's
+        await asyncio.sleep(2.0)
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_told_twice_to_leave_takes_its_time_all_the_same(tmp_path, environment, scheduler):
+    """SLURM tells the script and the worker, and the script tells the worker."""
+    log = tmp_path / "worker.log"
+    with log.open("wb") as lines, running(start_worker(environment, stderr=lines)) as script:
+        with Client(scheduler) as client:
+            client.wait_for_workers(1, timeout=PATIENCE_S)
+            client.register_plugin(SlowPlugin())
+        [dask] = psutil.Process(script.pid).children()
+        dask.terminate()
+        wait_until(lambda: "Stopping worker" in log.read_text(), "it never leaves")
+        script.terminate()
+        assert script.wait(PATIENCE_S) == 0
+    assert "End worker" in log.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("begun", ["sleep", "dask"])
+def test_a_worker_that_is_told_to_leave_before_it_is_up_leaves(tmp_path, environment, begun):
+    """While it waits for the scheduler's file, or looks for the scheduler."""
+    if begun == "dask":
+        (tmp_path / "scheduler.json").write_text(json.dumps({"address": f"tcp://{HOST}:{free_port()}"}))
+    with running(start_worker(environment)) as script:
+
+        def has_begun() -> bool:
+            return any(begun in word for child in psutil.Process(script.pid).children() for word in words_of(child))
+
+        wait_until(has_begun, "it never begins")
+        script.terminate()
+        assert script.wait(DEATH_TIMEOUT_S / 2) == 0
 
 
 @pytest.mark.slow
@@ -122,10 +174,9 @@ def test_with_tls_a_job_runs_and_nobody_without_a_certificate_gets_in(tmp_path, 
         "with DaskExecutor(sys.argv[2], root, patience_s=90.0) as executor:\n"
         "    print(run_synthetic(root, executor, capacity=executor.capacity, machine=executor.machine).kind)\n"
     )
-    worker = ["bash", str(CLUSTER / "worker.sh"), "CPU=1", "MEM=2e9"]
     with (
         running(subprocess.Popen(command, env=encrypted, stderr=subprocess.DEVNULL)),
-        running(subprocess.Popen(worker, env=encrypted, stdout=subprocess.DEVNULL)) as loop,
+        running(start_worker(encrypted)) as loop,
     ):
         job = [sys.executable, "-c", program, str(tmp_path / "job"), f"tls://{HOST}:{port}"]
         ran = subprocess.run(job, env=encrypted, capture_output=True, text=True, check=False)
