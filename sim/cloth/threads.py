@@ -28,9 +28,9 @@ class ThreadSolver:
     stiff rods", here without branches), which the Thomas algorithm solves in one pass forth and one back. A thread acts
     as a chain of pieces instead of one of springs, and stretches less by the length of a piece.
 
-    Directions are those of the start, as in SHAKE (Ryckaert, Ciccotti & Berendsen 1977): then a swinging sheet keeps its
-    energy and its angular momentum, of which directions of the prediction take a part in every step. Springs that turn
-    far in a step, as where cloth buckles, push along the prediction, as nothing else leads to their length.
+    Directions are those of the start, as in SHAKE (Ryckaert, Ciccotti & Berendsen 1977): then a swinging sheet keeps
+    its energy, of which directions of the prediction take a part in every step. Springs that turn far in a step, as
+    where cloth buckles, push along the prediction, as nothing else leads to their length.
 
     With fixed directions tension pulls nodes back across the thread as an explicit force does: beyond
     dt < |d| (m / 2 T |d|)^(1/2), the time in which a wave passes a spring, that overshoots, and a cloth that hangs from
