@@ -224,9 +224,9 @@ class ClothParameters(Parameters):
     iterations: Annotated[int, Field(ge=1, le=100)] | None = Field(
         default=None,
         description="Sweeps of xpbd over its springs in every step [-]; if omitted as many as it takes for no spring "
-        f"to be longer than its tension makes it, up to {MOST_SWEEPS}. A sweep does not let every spring know of all that "
-        "hangs on it: cloth that hangs from single points, and any mesh, stretches too much there, by less with each "
-        "sweep and with the square of the step; a run warns of springs that get half too long by it.",
+        f"to be longer than its tension makes it, up to {MOST_SWEEPS}. A sweep does not let every spring know of all "
+        "that hangs on it: cloth that hangs from single points, and any mesh, stretches too much there, by less with "
+        "each sweep and with the square of the step; a run warns of springs that get half too long by it.",
     )
 
     @model_validator(mode="before")
