@@ -22,7 +22,7 @@ MOST_REFINED = 16
 """Into so many parts those are divided at most."""
 
 MOST_SWEEPS = 8
-"""Sweeps over the springs in a step, at most, where no `iterations` are asked for."""
+"""Sweeps over the springs in a step, at most, where neither `iterations` nor `substeps` are asked for."""
 
 RUNAWAY_SPEED = 1.0e4
 """No cloth of a film moves at thirty times the speed of sound [m/s]."""
@@ -223,10 +223,11 @@ class ClothParameters(Parameters):
     )
     iterations: Annotated[int, Field(ge=1, le=100)] | None = Field(
         default=None,
-        description="Sweeps of xpbd over its springs in every step [-]; if omitted as many as it takes for no spring "
-        f"to be longer than its tension makes it, up to {MOST_SWEEPS}. A sweep does not let every spring know of all "
-        "that hangs on it: cloth that hangs from single points, and any mesh, stretches too much there, by less with "
-        "each sweep and with the square of the step; a run warns of springs that get half too long by it.",
+        description="Sweeps of xpbd over its springs in every step [-]; if omitted 1 where substeps are given, else as "
+        f"many as it takes for no spring to be longer than its tension makes it, up to {MOST_SWEEPS}. A sweep does not "
+        "let every spring know of all that hangs on it: cloth that hangs from single points, and any mesh, stretches "
+        "too much there, by less with each sweep and with the square of the step; a run warns of springs that get half "
+        "too long by it.",
     )
 
     @model_validator(mode="before")

@@ -249,14 +249,15 @@ class ClothSolver:
     def _displace(self, dt: float) -> None:
         """Springs, then contacts; how many sweeps and how long steps take from here on, by how much too long springs
         are [rest lengths], as they are left by each."""
-        integrator, sweeps = self._integrator, self.parameters[0].iterations
-        integrator.displace(dt, sweeps or self._sweeps)
+        integrator, shared = self._integrator, self.parameters[0]
+        adapts = shared.iterations is None and shared.substeps is None
+        integrator.displace(dt, self._sweeps if adapts else shared.iterations or 1)
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        by_springs = integrator.excess(dt) if is_loose else 0.0
+        by_springs = integrator.excess(dt) if adapts and is_loose else 0.0
         for contacts in self.contacts:
             contacts.resolve(self.state, dt)
-        self._excess = integrator.excess(dt) if self.contacts or not is_loose else by_springs
-        if by_springs > REFINED_BEYOND and sweeps is None and self._sweeps < MOST_SWEEPS:
+        self._excess = integrator.excess(dt) if self.contacts or not (adapts and is_loose) else by_springs
+        if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
             self._refinement = min(2 * self._refinement, MOST_REFINED)

@@ -73,7 +73,8 @@ def check_pin_load(start: ClothStart, job: Job, fluid_mass: float, findings: Fin
     fluid_share = fluid_mass / (float(start.sheet.node_area.sum()) * cloth.mass_per_area)
     substeps = cloth.substeps or DEFAULT_SUBSTEPS
     fall = math.hypot(*job.gravity) / (job.fps * substeps) ** 2
-    softness = (1.0 + fluid_share) * nodes / pinned * fall / (cloth.iterations or MOST_SWEEPS) / start.shortest_edge
+    sweeps = cloth.iterations or (MOST_SWEEPS if cloth.substeps is None else 1)
+    softness = (1.0 + fluid_share) * nodes / pinned * fall / sweeps / start.shortest_edge
     if softness > SOFTEST:
         load = f" and fluid of {fluid_share:.2g} times their mass" if fluid_share else ""
         enough = math.ceil(substeps * math.sqrt(softness / FIRM))
