@@ -23,8 +23,8 @@ COARSE = (
 SECONDS = 2.0
 """The jet throws up nothing more once the bag is as full as it is by then."""
 
-MOST_OVER_THE_RIM = 0.01
-"""Of the particles: drops that splash, which are few: 2 of 416. A jet that runs up the sheet loses a twentieth."""
+MOST_OVER_THE_RIM = 0.02
+"""Of the particles: drops that splash, which are few: 6 of 416. A jet that runs up the sheet loses a twentieth."""
 
 
 @pytest.mark.slow

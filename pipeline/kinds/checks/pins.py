@@ -8,7 +8,7 @@ from pipeline.kinds.checks.cloth_start import ClothStart
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from sim.cloth.parameters import DEFAULT_SUBSTEPS, MOST_SWEEPS, ClothParameters
+from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
 from sim.cloth.pin_paths import path_of_pin
 
 SOFTEST, FIRM = 1.0, 0.5
@@ -73,8 +73,7 @@ def check_pin_load(start: ClothStart, job: Job, fluid_mass: float, findings: Fin
     fluid_share = fluid_mass / (float(start.sheet.node_area.sum()) * cloth.mass_per_area)
     substeps = cloth.substeps or DEFAULT_SUBSTEPS
     fall = math.hypot(*job.gravity) / (job.fps * substeps) ** 2
-    sweeps = cloth.iterations or (MOST_SWEEPS if cloth.substeps is None else 1)
-    softness = (1.0 + fluid_share) * nodes / pinned * fall / sweeps / start.shortest_edge
+    softness = (1.0 + fluid_share) * nodes / pinned * fall / (cloth.iterations or 1) / start.shortest_edge
     if softness > SOFTEST:
         load = f" and fluid of {fluid_share:.2g} times their mass" if fluid_share else ""
         enough = math.ceil(substeps * math.sqrt(softness / FIRM))

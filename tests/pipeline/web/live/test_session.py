@@ -78,15 +78,19 @@ def test_a_ball_that_is_dragged_down_pushes_the_cloth_and_let_go_is_thrown_back(
     session.ask(session.drags.grab, "rigid", "ball", (0.0, 0.0, 0.7), 7)
     run(session, 5)
     assert place(session, "ball")[2] == pytest.approx(0.62, abs=0.005)  # in hand, it does not fall
-    session.ask(session.drags.move, "rigid", "ball", (0.0, 0.0, 0.45), 7)
+    session.ask(session.drags.move, "rigid", "ball", (0.0, 0.0, 0.35), 7)
     run(session, 25)
     pressed = place(session, "ball")[2]
     assert pressed < 0.45  # its centre below where the sheet was
     assert lowest(session) < pressed - 0.07  # and the sheet under it, not around it
     session.ask(session.drags.release_all, 7)  # its browser is gone
-    run(session, 15)
+    heights = []
+    for _ in range(15):
+        run(session, 1)
+        heights.append(place(session, "ball")[2])
     assert not session.drags.held
-    assert place(session, "ball")[2] > pressed + 0.03
+    assert min(heights) > pressed - 0.002  # it does not sink on
+    assert max(heights) > pressed + 0.03
 
 
 def test_a_body_that_rests_can_be_led_and_stays_where_it_is_let_go(tmp_path):
