@@ -121,8 +121,8 @@ def test_a_taut_strip_does_not_jitter_across():
     for _ in range(60):
         solver.substep(solver.stable_dt())
     across = solver.state.velocity.to_numpy()[:, 1]
-    # The strip keeps it as waves; without `straighten` nodes move at 0.2 m/s.
-    assert np.abs(across).max() < 2e-3
+    # The strip keeps it as waves; without `straighten` nodes move at a metre a second.
+    assert np.abs(across).max() < 5e-3
 
 
 @pytest.mark.slow
