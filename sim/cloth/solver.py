@@ -247,8 +247,10 @@ class ClothSolver:
         self._time_s += dt
 
     def _displace(self, dt: float) -> None:
-        """Springs, then contacts; how many sweeps and how long steps take from here on, by how much too long springs
-        are [rest lengths], as they are left by each."""
+        """Springs, then contacts; as each leaves springs too long, the next step has more sweeps, or is shorter.
+
+        One sweep and no measure of springs by themselves where a job gives `substeps`: these are what it pays for.
+        """
         integrator, shared = self._integrator, self.parameters[0]
         adapts = shared.iterations is None and shared.substeps is None
         integrator.displace(dt, self._sweeps if adapts else shared.iterations or 1)

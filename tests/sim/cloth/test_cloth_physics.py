@@ -121,7 +121,9 @@ def test_a_taut_strip_does_not_jitter_across():
     for _ in range(60):
         solver.substep(solver.stable_dt())
     across = solver.state.velocity.to_numpy()[:, 1]
-    # The strip keeps it as waves; without `straighten` nodes move at a metre a second.
+    # The strip keeps it as waves, which grow a little towards the free end; without `straighten` nodes move at a metre
+    # a second.
+    assert np.square(across).sum() <= np.square(zigzag).sum()
     assert np.abs(across).max() < 5e-3
 
 
