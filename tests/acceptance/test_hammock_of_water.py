@@ -24,8 +24,8 @@ SECONDS = 2.0
 """The jet throws up nothing more once the bag is as full as it is by then."""
 
 MOST_OVER_THE_RIM = 0.02
-"""Of the particles: drops that splash, which are few: 3 to 7 of 416, with any damping of the cloth up to 0.1 s. A jet that
-runs up the sheet loses a twentieth."""
+"""Of the particles: drops that splash, which are few: 3 to 7 of 416, with any damping of the cloth up to 0.1 s. A jet
+that runs up the sheet loses a twentieth."""
 
 
 @pytest.mark.slow
