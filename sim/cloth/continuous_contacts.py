@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -187,8 +187,8 @@ class ContinuousContacts:
 
     # --- the substep ------------------------------------------------------------------------------------------------
 
-    def resolve(self, state: ClothState, dt: float) -> None:
-        """Change the displacements of a substep of dt [s] so that nothing crosses."""
+    def resolve(self, state: ClothState, dt: float, relax: Callable[[], bool]) -> None:
+        """Change the displacements of a substep of dt [s] so that nothing crosses; see `ClothContacts`."""
         motion = self._near.look(state)
         if not math.isfinite(motion) or motion > 1.0e6:
             return  # the solver says which quantity is not finite, or ran away
@@ -205,6 +205,8 @@ class ContinuousContacts:
                 left = 0
                 break
             self._push(state, found, is_first=True)
+            while relax():
+                self._push(state, found, is_first=False)
             left = self._keep_apart(state, found)
             change, beyond = self._near.measure_changes(state, self._sums.predicted)
             if not math.isfinite(change):

@@ -72,6 +72,9 @@ class ExplicitSprings:
     def displace(self, dt: float, sweeps: int) -> None:
         """Displacements follow from velocities alone."""
 
+    def sweep(self, dt: float) -> None:
+        """Nor do they follow contacts."""
+
 
 def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
     array = ti.ndarray(ti.i32, max(len(values), 1))

@@ -21,8 +21,9 @@ DEFAULT_SUBSTEPS = 20
 MOST_REFINED = 16
 """Into so many parts those are divided at most."""
 
-MOST_SWEEPS = 8
-"""Sweeps over the springs in a step, at most, where neither `iterations` nor `substeps` are asked for."""
+MOST_SWEEPS, MOST_TURNS = 8, 4
+"""Sweeps over the springs in a step, at most, where neither `iterations` nor `substeps` are asked for; and how often
+springs and contacts then take turns."""
 
 RUNAWAY_SPEED = 1.0e4
 """No cloth of a film moves at thirty times the speed of sound [m/s]."""

@@ -43,6 +43,7 @@ class RectangleSprings:
     def __init__(self, state: ClothState, grid: Grid, first_node: int) -> None:
         self._state, self._grid = state, grid
         self._blocks = row_blocks(grid.columns, grid.rows)
+        self._multipliers = ti.Vector.ndarray(LANES, ti.f32, self._blocks.u_x.shape[0])
         self._strips = (strips_of(grid.columns), strips_of(grid.rows))
         self._rectangle = rectangle_of(grid, first_node)
         lengths = (grid.rows, grid.columns)
@@ -83,7 +84,6 @@ class RectangleSprings:
                 short,
             )
         for sweep in range(sweeps):
-            is_first = int(sweep == 0)
             for parity in range(2):
                 solve_diagonals(
                     blocks,
@@ -93,23 +93,33 @@ class RectangleSprings:
                     float(np.hypot(grid.step_x, grid.step_y)),
                     state.quantum,
                     dt * dt,
-                    is_first,
+                    int(sweep == 0),
                     short,
                 )
-            for axis in (ALONG_X, ALONG_Y):
-                solve_lines(
-                    blocks,
-                    self._lines[axis],
-                    self._thread_stiffness[axis],
-                    self._steps[axis],
-                    state.quantum,
-                    dt * dt,
-                    is_first,
-                    short,
-                )
+            self._solve_threads(dt, is_first=sweep == 0)
         for axis in (ALONG_X, ALONG_Y):
             straighten_lines(blocks, self._lines[axis], short)
         store_blocks(blocks, state.nodes, self._rectangle, short)
+
+    def sweep(self, dt: float) -> None:
+        """Solve the threads once more, after contacts."""
+        load_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
+        self._solve_threads(dt, is_first=False)
+        store_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
+
+    def _solve_threads(self, dt: float, *, is_first: bool) -> None:
+        for axis in (ALONG_X, ALONG_Y):
+            solve_lines(
+                self._blocks,
+                self._lines[axis],
+                self._thread_stiffness[axis],
+                self._steps[axis],
+                self._state.quantum,
+                dt * dt,
+                int(is_first),
+                self._multipliers,
+                self._is_short,
+            )
 
     def excess(self, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
@@ -117,7 +127,8 @@ class RectangleSprings:
         across = {ALONG_Y: (columns, columns, 1), ALONG_X: (rows, 1, columns)}
         found = [
             measure_excess_in_lines(
-                self._blocks,
+                self._multipliers,
+                self._blocks.turned,
                 self._lines[axis],
                 lines,
                 self._rectangle.first,

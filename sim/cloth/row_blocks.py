@@ -31,6 +31,7 @@ SKEW = 5
 
 Block = ti.types.vector(LANES, ti.f32)
 IntegerBlock = ti.types.vector(LANES, ti.i32)
+Blocks = ti.types.ndarray(dtype=Block, ndim=1)
 
 
 @ti.data_oriented
@@ -46,7 +47,7 @@ class RowBlocks:
         u_x, u_y, u_z: displacements [m].
         predicted_x, predicted_y, predicted_z: displacements before any spring acted, upright [m].
         inverse_mass: [1/kg].
-        n_x, n_y, n_z, inverse_length, change, factor, tension, multiplier: of the spring that leads on from the node.
+        n_x, n_y, n_z, inverse_length, change, factor, tension: of the spring that leads on from the node.
         diagonal_multiplier: of the diagonals of the cell above the node, upright; from `turned` on of the other ones.
         is_taut: whether piece p of the lines of strip s has tension to straighten, at `s * pieces + p`, and from
             `turned` on for turned ones.
@@ -63,7 +64,7 @@ class RowBlocks:
         self.u_x, self.u_y, self.u_z, self.inverse_mass = (_blocks(count) for _ in range(4))
         self.predicted_x, self.predicted_y, self.predicted_z = (_blocks(count) for _ in range(3))
         self.n_x, self.n_y, self.n_z, self.inverse_length = (_blocks(count) for _ in range(4))
-        self.change, self.factor, self.tension, self.multiplier = (_blocks(count) for _ in range(4))
+        self.change, self.factor, self.tension = (_blocks(count) for _ in range(3))
         self.diagonal_multiplier = _blocks(count)
         self.is_taut = ti.field(ti.i32, shape=count)
         # The air has done before springs start, and works in the same memory.

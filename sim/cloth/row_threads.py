@@ -4,7 +4,7 @@ import taichi as ti
 
 from sim.cloth.bundles import Lines
 from sim.cloth.device_springs import TINY_LENGTH
-from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, turn_strip
+from sim.cloth.row_blocks import LANES, Block, Blocks, turn_displacements, turn_displacements_back, turn_strip
 from sim.cloth.springs import SEGMENT_LENGTH
 from sim.cloth.threads import LEAST_ALIKE, STRAIGHTENED, TURNED_EXPLICITLY
 from sim.core.arrays import Floats
@@ -29,11 +29,13 @@ def solve_lines(
     quantum: ti.f32,
     dt_squared: ti.f32,
     is_first: ti.i32,
+    multipliers: Blocks,
     is_short: ti.template(),
 ):
     """The threads along one direction, piece by piece, even pieces first; arguments as of `bend_lines`.
 
-    `rest` is the length of a spring [m]; multipliers start at 0 if `is_first`.
+    `rest` is the length of a spring [m]; `multipliers` of the spring that leads on from each node start at 0 if
+    `is_first`.
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -61,6 +63,7 @@ def solve_lines(
                     rest,
                     quantum,
                     is_first,
+                    multipliers,
                     first + strip * pieces + piece,
                 )
         if along.is_turned:
@@ -68,7 +71,9 @@ def solve_lines(
 
 
 @ti.func
-def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, rest, quantum, is_first, number):
+def solve_pieces(
+    blocks: ti.template(), line, strips, start, stop, compliance, rest, quantum, is_first, multipliers: Blocks, number
+):
     """One piece of LANES threads exactly: the Thomas algorithm forth, then back, where nodes move."""
     n_x, n_y, n_z = Block(0.0), Block(0.0), Block(0.0)
     inverse_pivot, solved = Block(0.0), Block(0.0)
@@ -79,7 +84,7 @@ def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, r
         b_x, b_y, b_z, w_b = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b], blocks.inverse_mass[b]
         p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
         q_x, q_y, q_z = blocks.lattice_x[b], blocks.lattice_y[b], blocks.lattice_z[b]
-        multiplier = blocks.multiplier[a]
+        multiplier = multipliers[a]
         inverse_length, factor = Block(0.0), Block(0.0)
         for at in range(LANES):
             s_x = quantum * ti.cast(p_x[at] - q_x[at], ti.f32)
@@ -110,7 +115,7 @@ def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, r
             n_z[at] = m_z
         blocks.n_x[a], blocks.n_y[a], blocks.n_z[a] = n_x, n_y, n_z
         blocks.change[a], blocks.factor[a], blocks.inverse_length[a] = solved, factor, inverse_length
-        blocks.multiplier[a] = multiplier
+        multipliers[a] = multiplier
     factor_after, change = Block(0.0), Block(0.0)
     after_x, after_y, after_z = Block(0.0), Block(0.0), Block(0.0)  # the push of the spring after the node
     largest = Block(0.0)
@@ -120,7 +125,7 @@ def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, r
         b_x, b_y, b_z, w_b = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b], blocks.inverse_mass[b]
         s_x, s_y, s_z, w_a = blocks.n_x[a], blocks.n_y[a], blocks.n_z[a], blocks.inverse_mass[a]
         forward, factor, inverse_length = blocks.change[a], blocks.factor[a], blocks.inverse_length[a]
-        multiplier = blocks.multiplier[a]
+        multiplier = multipliers[a]
         tension = Block(0.0)
         for at in range(LANES):
             own = forward[at] - factor_after[at] * change[at]
@@ -139,7 +144,7 @@ def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, r
             tension[at] = STRAIGHTENED * excess
             largest[at] = ti.max(largest[at], excess)
         blocks.u_x[b], blocks.u_y[b], blocks.u_z[b] = b_x, b_y, b_z
-        blocks.multiplier[a], blocks.tension[a] = multiplier, tension
+        multipliers[a], blocks.tension[a] = multiplier, tension
     head = line + start * strips
     a_x, a_y, a_z, w_a = blocks.u_x[head], blocks.u_y[head], blocks.u_z[head], blocks.inverse_mass[head]
     for at in range(LANES):

@@ -18,6 +18,7 @@ from sim.cloth.parameters import (
     DEFAULT_SUBSTEPS,
     MOST_REFINED,
     MOST_SWEEPS,
+    MOST_TURNS,
     RUNAWAY_SPEED,
     ClothParameters,
     shared_conflicts,
@@ -44,9 +45,10 @@ INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 LOST_DISTANCE = 10.0
 """Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
 
-REFINED_BEYOND, RESTORED_BELOW = 0.05, 0.01
-"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length, and below
-which it goes back: the excess falls with every sweep, and with the square of the step."""
+REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW = 0.05, 0.03, 0.02
+"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; beyond
+which springs and contacts take another turn; and below which steps go back. It falls with every turn and sweep, and
+with the square of the step."""
 
 LIVE_KEYS = frozenset(
     (
@@ -247,23 +249,35 @@ class ClothSolver:
         self._time_s += dt
 
     def _displace(self, dt: float) -> None:
-        """Springs, then contacts; as each leaves springs too long, the next step has more sweeps, or is shorter.
+        """Springs and contacts in turns; as these leave springs too long, the next step has more sweeps, or is shorter.
 
-        One sweep and no measure of springs by themselves where a job gives `substeps`: these are what it pays for.
+        One sweep, and no measure of springs by themselves, where a job gives `substeps`: these are what it pays for.
         """
         integrator, shared = self._integrator, self.parameters[0]
         adapts = shared.iterations is None and shared.substeps is None
+        turns_left = MOST_TURNS if shared.iterations is None else 0
         integrator.displace(dt, self._sweeps if adapts else shared.iterations or 1)
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
         by_springs = integrator.excess(dt) if adapts and is_loose else 0.0
+        excess = by_springs if adapts and is_loose else None
+
+        def relax() -> bool:
+            nonlocal turns_left, excess
+            excess = integrator.excess(dt)
+            if not turns_left or excess < RELAXED_BEYOND:
+                return False
+            turns_left -= 1
+            integrator.sweep(dt)
+            return True
+
         for contacts in self.contacts:
-            contacts.resolve(self.state, dt)
-        self._excess = integrator.excess(dt) if self.contacts or not (adapts and is_loose) else by_springs
+            contacts.resolve(self.state, dt, relax)
+        self._excess = integrator.excess(dt) if excess is None else excess
         if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
             self._refinement = min(2 * self._refinement, MOST_REFINED)
-        elif self._excess < RESTORED_BELOW:
+        elif self._excess < RESTORED_BELOW and turns_left >= MOST_TURNS - 1:
             self._refinement = max(self._refinement // 2, 1)
         if by_springs < RESTORED_BELOW:
             self._sweeps = max(self._sweeps // 2, 1)

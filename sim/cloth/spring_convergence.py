@@ -8,7 +8,7 @@ is drawn to twice its length has none of it.
 import taichi as ti
 
 from sim.cloth.bundles import Lines, Nodes, SpringArrays
-from sim.cloth.row_blocks import LANES
+from sim.cloth.row_blocks import LANES, Blocks
 from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
@@ -50,7 +50,8 @@ def measure_excess(
 
 @kernel
 def measure_excess_in_lines(
-    blocks: ti.template(),
+    multipliers: Blocks,
+    turned: ti.i32,
     along: Lines,
     lines: ti.i32,
     first_node: ti.i32,
@@ -64,7 +65,8 @@ def measure_excess_in_lines(
     """The same of a rectangle's threads along one direction.
 
     Args:
-        blocks: workspace after the rectangle's step, with the multipliers; places as in `solve_lines`.
+        multipliers: from `solve_lines`, and at the same places.
+        turned: first turned block.
         along: the lines.
         lines: how many there are.
         first_node: of the rectangle.
@@ -80,9 +82,9 @@ def measure_excess_in_lines(
         for k in range(along.length - 1):
             block = line // LANES + k * along.strips
             if along.is_turned:
-                block += blocks.turned
+                block += turned
             i = first_node + line * line_step + k * node_step
-            multiplier = blocks.multiplier[block][line % LANES]
+            multiplier = multipliers[block][line % LANES]
             excess = excess_of(i, i + node_step, rest, stiffness[line], multiplier, nodes, dt_squared)
             largest = ti.max(largest, excess)
             if excess > LARGEST_RESIDUAL:

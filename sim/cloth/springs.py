@@ -42,8 +42,8 @@ Indices = NDArray[np.int32]
 STRETCH, SHEAR, BEND = range(3)
 """Which stiffness of the sheet a spring takes."""
 
-SEGMENT_LENGTH = 64
-"""Springs of a thread that are solved at once."""
+SEGMENT_LENGTH = 1023
+"""Springs of a thread that are solved at once, at most: with as many nodes as a block of a GPU has threads."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,6 +112,13 @@ class XPBDSprings:
             rectangle.displace(dt, sweeps)
         self._momentum.restore(dt)
 
+    def sweep(self, dt: float) -> None:
+        """Solve the threads and edges of the step once more, after contacts have pushed."""
+        for threads in self._threads:
+            threads.displace(self._state, dt, is_first=False)
+        for rectangle in self._rectangles.values():
+            rectangle.sweep(dt)
+
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
         state = self._state
         for colour in springs.first_colours:

@@ -65,7 +65,7 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
     state = solver.state
     state.displacement.from_numpy(displacement.astype(np.float32))
     for contacts in solver.contacts:
-        contacts.resolve(state, dt)
+        contacts.resolve(state, dt, lambda: False)
     allowed = state.displacement.to_numpy().astype(np.float64)
     finish_step(state.nodes, state.motion, state.position, state.limit, dt, False)
     return allowed

@@ -24,7 +24,6 @@ from cloth_scenes import (
 )
 
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
-from sim.cloth.springs import SEGMENT_LENGTH
 from sim.cloth.stable_step import STEP_SAFETY
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -68,17 +67,15 @@ def test_every_row_of_a_hanging_column_stretches_by_the_weight_below_it(integrat
     np.testing.assert_allclose(row_stretches(solver, rows), np.stack([theory, theory], axis=1), rtol=0.01)
 
 
-def test_xpbd_stretches_long_threads_more_than_they_should_by_what_is_said():
-    """The last spring of a piece of thread by n g dt² for n nodes below it, as `XPBDSprings` tells, and no other."""
+def test_xpbd_stretches_long_threads_by_what_hangs_on_them_alone():
+    """Not by n g dt² for n nodes below, as the last springs of pieces do that are solved apart from each other."""
     rows = 101
     solver = column(rows, "xpbd", 4000.0, substeps=DEFAULT_SUBSTEPS, iterations=1)
     settle(solver, 10, 80)
     stiffness = 4000.0 * 0.05 * (rows - 1)
     weight = 0.15 * 0.05 * GRAVITY * (np.arange(rows - 1, 0, -1) - 0.5) / (rows - 1)
     excess = row_stretches(solver, rows).mean(axis=1) - weight / stiffness
-    last = rows - 1 - SEGMENT_LENGTH  # threads are divided from the lower end on
-    assert excess[last] == pytest.approx(SEGMENT_LENGTH * GRAVITY * solver.stable_dt() ** 2, rel=0.05)
-    assert np.abs(np.delete(excess, last)).max() < 0.02 * excess[last]
+    assert np.abs(excess).max() < 0.01 * rows * GRAVITY * solver.stable_dt() ** 2
 
 
 def test_a_mesh_hangs_as_far_down_as_its_stiffness_lets_it(tmp_path):
