@@ -204,9 +204,7 @@ class ContinuousContacts:
             if not found:
                 left = 0
                 break
-            self._push(state, found, is_first=True)
-            while relax():
-                self._push(state, found, is_first=False)
+            self._push(state, found, is_first=True, relax=relax)
             left = self._keep_apart(state, found)
             change, beyond = self._near.measure_changes(state, self._sums.predicted)
             if not math.isfinite(change):
@@ -241,13 +239,18 @@ class ContinuousContacts:
             if not self._contacts.make_room_for(found):
                 return found
 
-    def _push(self, state: ClothState, count: int, *, is_first: bool) -> None:
+    def _push(
+        self, state: ClothState, count: int, *, is_first: bool, relax: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Push; first in turns with the springs, for as long as these `relax`."""
         short = self._is_short(count)
-        pushing, touched, missing = self._begin_push(state, count, is_first=is_first, short=short)
-        if not pushing:
-            return
-        self._iterations += STEPS
-        if not np.int32(missing).view(np.float32) <= TOLERANCE:
+        while True:
+            pushing, touched, missing = self._begin_push(state, count, is_first=is_first, short=short)
+            self._iterations += STEPS if pushing else 0
+            if not pushing or not relax():
+                break
+            is_first = False
+        if pushing and not np.int32(missing).view(np.float32) <= TOLERANCE:
             for first in range(0, MORE_ITERATIONS, STEPS):
                 self._push_on(pushing, touched, first, short=short)
             self._iterations += MORE_ITERATIONS
