@@ -8,11 +8,11 @@ from sim.cloth.bundles import Lines
 from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, load_blocks, rectangle_of, row_blocks, store_blocks, strips_of
-from sim.cloth.row_springs import bend_lines, solve_diagonals
-from sim.cloth.row_threads import solve_lines, straighten_lines
+from sim.cloth.row_springs import bend_lines, solve_cells_in_rows
+from sim.cloth.row_threads import measure_lines, solve_lines, straighten_lines
 from sim.cloth.sheet import Grid
 from sim.cloth.spring_convergence import measure_excess_in_lines
-from sim.cloth.springs import bend_share, diagonal_share, line_widths
+from sim.cloth.springs import bend_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import is_short
@@ -53,7 +53,8 @@ class RectangleSprings:
         self._thread_stiffness, self._bend_stiffness = (
             tuple(ti.ndarray(ti.f32, strips * LANES) for strips in self._strips) for _ in range(2)
         )
-        self._diagonal_stiffness = self._bend_damping = 0.0
+        self._cell_stiffness = self._poisson = self._bend_damping = 0.0
+        self._strains = (self._blocks.strain_y, self._blocks.strain_x)
         self._is_short = is_short(grid.columns * grid.rows, NODE_IN_ROWS_NS)
 
     def take_parameters(self, cloth: ClothParameters) -> None:
@@ -63,9 +64,10 @@ class RectangleSprings:
         for axis, ((lines, spacing), step) in enumerate(zip(across, self._steps, strict=True)):
             width = line_widths(lines, spacing)
             padding = np.zeros(self._strips[axis] * LANES - lines)
-            _fill(self._thread_stiffness[axis], cloth.stretch_stiffness * width / step, padding + 1.0)
+            _fill(self._thread_stiffness[axis], cloth.plane_stiffness * width / step, padding + 1.0)
             _fill(self._bend_stiffness[axis], cloth.bend_stiffness * bend_share(width, step), padding)
-        self._diagonal_stiffness = (cloth.shear_stiffness or 0.0) * diagonal_share(grid)
+        self._cell_stiffness = cloth.shear_stiffness * grid.step_x * grid.step_y
+        self._poisson = cloth.poisson_ratio
         self._bend_damping = cloth.bend_damping
 
     def displace(self, dt: float, sweeps: int) -> None:
@@ -85,18 +87,20 @@ class RectangleSprings:
         for sweep in range(sweeps):
             is_first = int(sweep == 0)
             for parity in range(2):
-                solve_diagonals(
+                solve_cells_in_rows(
                     blocks,
                     parity,
                     self._rectangle,
-                    self._diagonal_stiffness,
-                    float(np.hypot(grid.step_x, grid.step_y)),
+                    ti.math.vec2(grid.step_x, grid.step_y),
+                    self._cell_stiffness,
                     state.quantum,
                     dt * dt,
                     is_first,
                     short,
                 )
             for axis in (ALONG_X, ALONG_Y):
+                if self._poisson > 0.0:
+                    self._measure(1 - axis)
                 solve_lines(
                     blocks,
                     self._lines[axis],
@@ -105,11 +109,24 @@ class RectangleSprings:
                     state.quantum,
                     dt * dt,
                     is_first,
+                    self._poisson,
+                    self._strains[1 - axis],
                     short,
                 )
         for axis in (ALONG_X, ALONG_Y):
             straighten_lines(blocks, self._lines[axis], short)
         store_blocks(blocks, state.nodes, self._rectangle, short)
+
+    def _measure(self, axis: int) -> None:
+        """Strains of the threads along one direction, for those along the other one."""
+        measure_lines(
+            self._blocks,
+            self._lines[axis],
+            self._steps[axis],
+            self._state.quantum,
+            self._strains[axis],
+            self._is_short,
+        )
 
     def excess(self, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
@@ -125,6 +142,8 @@ class RectangleSprings:
                 line_step,
                 self._thread_stiffness[axis],
                 self._steps[axis],
+                self._poisson,
+                self._strains[1 - axis],
                 state.nodes,
                 dt * dt,
             )

@@ -47,7 +47,8 @@ class RowBlocks:
         predicted_x, predicted_y, predicted_z: displacements before any spring acted, upright [m].
         inverse_mass: [1/kg].
         n_x, n_y, n_z, inverse_length, change, factor, tension, multiplier: of the spring that leads on from the node.
-        diagonal_multiplier: of the diagonals of the cell above the node, upright; from `turned` on of the other ones.
+        cell_multiplier: of the shear of the cell above the node, upright.
+        strain_x, strain_y: of the springs along x and along y at the node, upright and turned.
         is_taut: whether piece p of the lines of strip s has tension to straighten, at `s * pieces + p`, and from
             `turned` on for turned ones.
         v_x, v_y, v_z, share, free_share: of the air's kernels: velocity [m/s], share in the force on any triangle, and
@@ -64,7 +65,7 @@ class RowBlocks:
         self.predicted_x, self.predicted_y, self.predicted_z = (_blocks(count) for _ in range(3))
         self.n_x, self.n_y, self.n_z, self.inverse_length = (_blocks(count) for _ in range(4))
         self.change, self.factor, self.tension, self.multiplier = (_blocks(count) for _ in range(4))
-        self.diagonal_multiplier = _blocks(count)
+        self.cell_multiplier, self.strain_x, self.strain_y = (_blocks(count) for _ in range(3))
         self.is_taut = ti.field(ti.i32, shape=count)
         # The air has done before springs start, and works in the same memory.
         self.v_x, self.v_y, self.v_z = self.predicted_x, self.predicted_y, self.predicted_z

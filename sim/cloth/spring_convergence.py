@@ -21,13 +21,20 @@ rubber sheet does that a heavy ball falls into; a bag of water that hangs from f
 
 @func
 def excess_of(
-    i: ti.i32, j: ti.i32, rest: ti.f32, stiffness: ti.f32, multiplier: ti.f32, nodes: Nodes, dt_squared: ti.f32
+    i: ti.i32,
+    j: ti.i32,
+    rest: ti.f32,
+    shift: ti.f32,
+    stiffness: ti.f32,
+    multiplier: ti.f32,
+    nodes: Nodes,
+    dt_squared: ti.f32,
 ) -> ti.f32:
-    """(|d| - rest + l/(k dt²)) / rest, nothing for a spring between two nodes that are held."""
+    """(|d| - rest + shift + l/(k dt²)) / rest, nothing for a spring between two nodes that are held."""
     d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
         nodes.displacement[i] - nodes.displacement[j]
     )
-    excess = (d.norm() - rest + multiplier / (stiffness * dt_squared)) / rest
+    excess = (d.norm() - rest + shift + multiplier / (stiffness * dt_squared)) / rest
     return ti.select(nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0, excess, 0.0)
 
 
@@ -41,7 +48,9 @@ def measure_excess(
     largest, unconverged = 0.0, 0.0
     for s in range(count):
         i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        excess = excess_of(i, j, springs.law[s][0], springs.law[s][1], multiplier[s], nodes, dt_squared)
+        excess = excess_of(
+            i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
+        )
         ti.atomic_max(largest, excess)
         if excess > LARGEST_RESIDUAL:
             unconverged += 1.0
@@ -58,6 +67,8 @@ def measure_excess_in_lines(
     line_step: ti.i32,
     stiffness: Floats,
     rest: ti.f32,
+    poisson: ti.f32,
+    across: ti.template(),
     nodes: Nodes,
     dt_squared: ti.f32,
 ) -> ti.math.vec2:
@@ -71,6 +82,8 @@ def measure_excess_in_lines(
         node_step, line_step: from a node to the next one of its line, and to the same of the next line.
         stiffness: of the springs of each line [N/m].
         rest: length of a spring [m].
+        poisson: Poisson's ratio [-].
+        across: strains at nodes along the other direction, as the threads took them, if `poisson` is not 0.
         nodes: of all cloths.
         dt_squared: [s²].
     """
@@ -83,7 +96,11 @@ def measure_excess_in_lines(
                 block += blocks.turned
             i = first_node + line * line_step + k * node_step
             multiplier = blocks.multiplier[block][line % LANES]
-            excess = excess_of(i, i + node_step, rest, stiffness[line], multiplier, nodes, dt_squared)
+            shift = 0.0
+            if poisson > 0.0:
+                after = block + along.strips
+                shift = 0.5 * poisson * rest * (across[block][line % LANES] + across[after][line % LANES])
+            excess = excess_of(i, i + node_step, rest, shift, stiffness[line], multiplier, nodes, dt_squared)
             largest = ti.max(largest, excess)
             if excess > LARGEST_RESIDUAL:
                 unconverged += 1.0

@@ -31,16 +31,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.cloth.cells import Cells
 from sim.cloth.colouring import greedy_colours
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet, triangle_areas
-from sim.cloth.strands import strands_of
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-STRETCH, SHEAR, BEND = range(3)
-"""Which stiffness of the sheet a spring takes."""
+ALONG_X, ALONG_Y, BEND = range(3)
+"""Of a spring: a thread of a rectangle along x or y, or a bend."""
 
 SEGMENT_LENGTH = 64
 """Springs of a thread that are solved at once."""
@@ -85,7 +85,7 @@ class Springs:
 
     def stiffness(self, cloth: ClothParameters) -> Floats:
         """k of each spring in a cloth [N/m], (m,)."""
-        sheet = (cloth.stretch_stiffness, cloth.shear_stiffness or 0.0, cloth.bend_stiffness)
+        sheet = (cloth.plane_stiffness, cloth.plane_stiffness, cloth.bend_stiffness)
         return self.share * np.array(sheet)[self.kind]
 
     def damping(self, cloth: ClothParameters) -> Floats:
@@ -96,31 +96,11 @@ class Springs:
 def springs_of(sheet: RestSheet) -> list[Springs]:
     """All springs of a sheet, in the order in which they are solved."""
     if sheet.grid is not None:
-        return [_grid_bends(sheet.grid), _grid_diagonals(sheet.grid), _grid_threads(sheet.grid)]
-    return [_mesh_bends(sheet), _mesh_edges(sheet)]
+        return [_grid_bends(sheet.grid), _grid_threads(sheet.grid)]
+    return [_mesh_bends(sheet)]
 
 
 # --- rectangles ----------------------------------------------------------------------------------------------------
-
-
-def _grid_diagonals(grid: Grid) -> Springs:
-    """Both of each cell, those of every second row of cells first."""
-    number = _numbers(grid)
-    length = float(np.hypot(grid.step_x, grid.step_y))
-    row = np.broadcast_to(np.arange(grid.rows - 1)[:, None], (grid.rows - 1, grid.columns - 1)) % 2
-    share = diagonal_share(grid)
-    ends = [(number[:-1, :-1], number[1:, 1:]), (number[:-1, 1:], number[1:, :-1])]
-    nodes = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in ends])
-    count = len(nodes)
-    return Springs(
-        nodes,
-        np.tile([1.0, -1.0], (count, 1)),
-        np.full(count, length),
-        np.full(count, share),
-        _all(SHEAR, count),
-        np.concatenate([2 * row.ravel(), 2 * row.ravel() + 1]).astype(np.int32),
-        _all(-1, count),
-    )
 
 
 def _grid_threads(grid: Grid) -> Springs:
@@ -140,7 +120,7 @@ def _grid_threads(grid: Grid) -> Springs:
                 np.tile([1.0, -1.0], (count, 1)),
                 np.full(count, step),
                 (width / step).ravel(),
-                _all(STRETCH, count),
+                _all((ALONG_X, ALONG_Y)[axis], count),
                 colour.ravel().astype(np.int32),
                 segment.ravel().astype(np.int32),
             )
@@ -183,11 +163,6 @@ def bend_share(width: Floats, step: float) -> Floats:
     return share
 
 
-def diagonal_share(grid: Grid) -> float:
-    """Stiffness of a diagonal over that of the sheet against shear [-]."""
-    return (grid.step_x**2 + grid.step_y**2) / (2.0 * grid.step_x * grid.step_y)
-
-
 def _directions(grid: Grid) -> list[tuple[int, Indices, float, float]]:
     """Of x and y: number of the axis, nodes of each thread (threads, nodes), their distance, that of threads [m]."""
     number = _numbers(grid)
@@ -203,24 +178,6 @@ def _all(value: int, count: int) -> Indices:
 
 
 # --- meshes --------------------------------------------------------------------------------------------------------
-
-
-def _mesh_edges(sheet: RestSheet) -> Springs:
-    """One along each edge, strand by strand."""
-    edges, triangle_area = edges_of(sheet.triangles), triangle_areas(sheet.vertices, sheet.triangles)
-    area = np.bincount(edges.of_side, weights=np.repeat(triangle_area, 3), minlength=len(edges.nodes))
-    number, nodes, strand, colour = strands_of(edges.nodes, sheet.vertices)
-    ends = sheet.vertices[nodes]
-    rest = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    return Springs(
-        nodes,
-        np.tile([1.0, -1.0], (len(rest), 1)),
-        rest,
-        area[number] / rest**2,
-        _all(STRETCH, len(rest)),
-        colour,
-        strand,
-    )
 
 
 def _mesh_bends(sheet: RestSheet) -> Springs:
@@ -306,13 +263,37 @@ def joined_springs(
     return joined
 
 
-def _joined(parts: list[Springs]) -> Springs:
+def joined_cells(
+    parts: list[Cells], node_offsets: list[int], *, apart: Collection[int] = ()
+) -> list[tuple[Cells, Indices]]:
+    """Cells of several cloths, those with as many nodes together and sorted by colour, and the cloth of each.
+
+    Args:
+        parts: the cells of each cloth.
+        node_offsets: number of its first node.
+        apart: cloths whose cells are not joined with those of the others.
+    """
+    families: dict[tuple[bool, int], list[int]] = {}
+    for number, cells in enumerate(parts):
+        families.setdefault((number in apart, cells.arity), []).append(number)
+    joined = []
+    for key in sorted(families):
+        own = families[key]
+        moved = [replace(parts[n], nodes=(parts[n].nodes + node_offsets[n]).astype(np.int32)) for n in own]
+        cloth_of = np.concatenate([_all(number, len(parts[number])) for number in own])
+        cells = _joined(moved)
+        order = np.argsort(cells.colour, kind="stable")
+        joined.append((_mapped(lambda array, rows=order: array[rows], cells), cloth_of[order]))
+    return joined
+
+
+def _joined(parts: list[Any]) -> Any:
     return _mapped(lambda *arrays: np.concatenate(arrays), *parts)
 
 
-def _mapped(function: Callable[..., Any], *parts: Springs) -> Springs:
-    """Springs whose arrays are a function of those of others."""
-    return Springs(*(function(*(getattr(part, field.name) for part in parts)) for field in fields(Springs)))
+def _mapped(function: Callable[..., Any], *parts: Any) -> Any:
+    """Springs or cells whose arrays are a function of those of others."""
+    return type(parts[0])(*(function(*(getattr(part, field.name) for part in parts)) for field in fields(parts[0])))
 
 
 def _cotangent(first: Floats, second: Floats) -> Floats:

@@ -60,6 +60,7 @@ class ThreadSolver:
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
         springs = self._springs
+        springs.contract(state.nodes)
         for colour in springs.first_colours:
             solve_threads(springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work)
 
@@ -113,7 +114,7 @@ def solve_threads(
             work.direction[s] = work.tension[s] * d
             if at_start.dot(d) > LEAST_ALIKE * start_length * length:
                 work.direction[s] = at_start / start_length
-            work.change[s] = springs.law[s][0] - length - compliance * work.multiplier[s]
+            work.change[s] = springs.law[s][0] - springs.shift[s] - length - compliance * work.multiplier[s]
             work.lower[s] = -nodes.inverse_mass[i]
             work.diagonal[s] = nodes.inverse_mass[i] + nodes.inverse_mass[j] + compliance
         for p in range(first_piece, end_piece):
