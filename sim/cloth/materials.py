@@ -51,7 +51,8 @@ MATERIALS: Mapping[Material, Mapping[str, float]] = {
         "friction": 0.9,
     },
 }
-"""Mass per area [kg/m²], stretch and shear stiffness [N/m], Poisson's ratio [-], bending rigidity [N m], thickness [m], friction [-].
+"""Mass per area [kg/m²], stretch and shear stiffness [N/m], Poisson's ratio [-], bending rigidity [N m], thickness [m],
+friction [-].
 
 Woven cloths lie within the ranges that Kawabata's instruments find at small loads (Kawabata 1980, "The standardization
 and analysis of hand evaluation"; Hu 2004, "Structure and mechanics of woven fabrics", ch. 4-6), here for a shirting of

@@ -140,15 +140,23 @@ def solve_cells_in_rows(
                     down_y = quantum * ti.cast(p_y[at + 1] - q_y[at], ti.f32) + (a_y[at + 1] - b_y[at])
                     down_z = quantum * ti.cast(p_z[at + 1] - q_z[at], ti.f32) + (a_z[at + 1] - b_z[at])
                     # d_u + d_v and d_u - d_v, and their directions n and m.
-                    m, l = along + across, along - across
-                    n_x, n_y, n_z = m * up_x + l * down_x, m * up_y + l * down_y, m * up_z + l * down_z
-                    m_x, m_y, m_z = m * down_x + l * up_x, m * down_y + l * up_y, m * down_z + l * up_z
+                    total, between = along + across, along - across
+                    n_x, n_y, n_z = (
+                        total * up_x + between * down_x,
+                        total * up_y + between * down_y,
+                        total * up_z + between * down_z,
+                    )
+                    m_x, m_y, m_z = (
+                        total * down_x + between * up_x,
+                        total * down_y + between * up_y,
+                        total * down_z + between * up_z,
+                    )
                     longer = ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), TINY_LENGTH)
                     shorter = ti.max(ti.sqrt(m_x * m_x + m_y * m_y + m_z * m_z), TINY_LENGTH)
                     n_x, n_y, n_z = n_x / longer, n_y / longer, n_z / longer
                     m_x, m_y, m_z = m_x / shorter, m_y / shorter, m_z / shorter
                     # Derivatives of e_s by the corners: r of the upper right one, t of the lower right one.
-                    more, less = half * m, half * l
+                    more, less = half * total, half * between
                     r_x, r_y, r_z = more * n_x - less * m_x, more * n_y - less * m_y, more * n_z - less * m_z
                     t_x, t_y, t_z = less * n_x - more * m_x, less * n_y - more * m_y, less * n_z - more * m_z
                     weight = (w_a[at] + w_b[at + 1]) * (r_x * r_x + r_y * r_y + r_z * r_z) + (w_a[at + 1] + w_b[at]) * (
