@@ -98,9 +98,9 @@ class RectangleSprings:
                     is_first,
                     short,
                 )
+            for axis in (ALONG_X, ALONG_Y) if self._poisson > 0.0 else ():
+                self._measure(axis)
             for axis in (ALONG_X, ALONG_Y):
-                if self._poisson > 0.0:
-                    self._measure(1 - axis)
                 solve_lines(
                     blocks,
                     self._lines[axis],

@@ -11,15 +11,11 @@ curvature, so that it has no stiffness at all against the first bit of bending, 
 Stiffness, so that a sheet does not depend on how finely it is divided (per width and per strain; w is the width that a
 spring stands for, half on the border):
 
-- stretch E [N/m]: k = E w / L along a rectangle's threads; k = E A / L² on edges of a mesh, where A is the area of its
-  triangles (Van Gelder 1998, "Approximate simulation of elastic membranes by triangulated spring meshes"). On a lattice
-  of equal triangles that is exact, with a Poisson ratio of 1/3.
-- shear G [N/m]: k = G L² / (2 dx dy) on both diagonals of a cell: under a shear angle g each changes by g dx dy / L.
+- stretch C [N/m]: k = C w / L along a rectangle's threads, where C is the stiffness of a sheet that cannot contract
+  across; shear, and meshes, are a matter of `cells`.
 - bending B [N m]: k = B w / L³ over a node, where |d| = L² times the curvature; k = B / A about an edge, with the
   cotangents of Bergou et al. 2006, "A quadratic bending model for inextensible surfaces", sec. 3, as c. Both give a
   cylinder its energy B/2 curvature² per area, exactly on lattices of squares (along the threads) and equal triangles.
-
-A sheet of square cells has the stretch stiffness E + G and half of G across, because its diagonals are stretched too.
 """
 
 from __future__ import annotations
@@ -54,10 +50,10 @@ class Springs:
         nodes: (m, arity) int32.
         coefficients: c_a, (m, arity).
         rest: length without loads [m], (m,).
-        share: stiffness over that of the sheet, (m,): [-] of stretch and shear, [1/m²] of bending.
-        kind: STRETCH, SHEAR or BEND, (m,).
+        share: stiffness over that of the sheet, (m,): [-] of threads, [1/m²] of bends.
+        kind: ALONG_X, ALONG_Y or BEND, (m,).
         colour: (m,).
-        segment: piece of a thread, or strand of a mesh, that the spring belongs to, -1 where springs are solved one by
+        segment: piece of a thread that the spring belongs to, -1 where springs are solved one by
             one, (m,). Springs of a piece follow one another, each from the last node of the one before, and have one
             colour.
     """

@@ -225,7 +225,7 @@ def _swinging_sheet(duration: float) -> dict[str, Any]:
             velocity = solver.state.velocity.to_numpy().astype(np.float64)
             positions = solver.state.positions() - 0.5 * dt * velocity
             moving = 0.5 * float(mass @ (velocity**2).sum(axis=1))
-            elastic = sum(springs.energy(positions) for springs in solver._springs)
+            elastic = sum(family.energy(positions) for family in (*solver._springs, *solver._cells))
             times.append((step + 1) * dt)
             kinetic.append(moving / scale)
             energies.append((moving + elastic + GRAVITY * float(mass @ positions[:, 2])) / scale)
