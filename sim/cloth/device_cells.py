@@ -64,7 +64,9 @@ class DeviceCells:
 
 
 @func
-def derivative(coefficients: Floats, cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()) -> ti.math.vec3:
+def derivative(
+    coefficients: Floats, cells: CellArrays, nodes: Nodes, displacement: Vectors, s: ti.i32, arity: ti.template()
+) -> ti.math.vec3:
     """sum_a c_a x_a displaced; from differences, exact in integers, as sum_a c_a = 0."""
     d = ti.math.vec3(0.0)
     moved = ti.math.vec3(0.0)
@@ -74,7 +76,7 @@ def derivative(coefficients: Floats, cells: CellArrays, nodes: Nodes, s: ti.i32,
         c_a = coefficients[arity * s + a]
         if ti.static(a > 0):
             d += c_a * ti.cast(nodes.lattice[i] - first, ti.f32)
-        moved += c_a * nodes.displacement[i]
+        moved += c_a * displacement[i]
     return nodes.quantum * d + moved
 
 
@@ -123,8 +125,8 @@ def solve_cell(
 
     With nu times the strain across, warp and weft have the tension C (e_u + nu e_v): each takes the other as it is.
     """
-    d_u = derivative(cells.along, cells, nodes, s, arity)
-    d_v = derivative(cells.across, cells, nodes, s, arity)
+    d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, arity)
+    d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, arity)
     w = weights(cells, nodes, s, arity)
     p_u, p_v = ti.math.vec3(0.0), ti.math.vec3(0.0)
     law = cells.law[s]
@@ -183,8 +185,8 @@ def solve_cells(
 @func
 def damp_cell(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, arity: ti.template()):
     """Implicit Euler of the forces -tau k de/dt, strain by strain."""
-    d_u = derivative(cells.along, cells, nodes, s, arity)
-    d_v = derivative(cells.across, cells, nodes, s, arity)
+    d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
+    d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
     w = weights(cells, nodes, s, arity)
     law = cells.law[s]
     rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
@@ -242,8 +244,8 @@ def compute_cell_forces(
 ):
     """-dW/dd_u and -dW/dd_v of each cell with damping [N m], one after the other from `first` on."""
     for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, s, arity)
-        d_v = derivative(cells.across, cells, nodes, s, arity)
+        d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
+        d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
         rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
         rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
         law = cells.law[s]
@@ -273,8 +275,8 @@ def measure_cell_excess(
         ti.loop_config(serialize=True)
     largest, unconverged = 0.0, 0.0
     for s in range(count):
-        e_u = derivative(cells.along, cells, nodes, s, TRIANGLE).norm() - 1.0
-        e_v = derivative(cells.across, cells, nodes, s, TRIANGLE).norm() - 1.0
+        e_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
+        e_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
         law = cells.law[s]
         w = weights(cells, nodes, s, TRIANGLE)
         if w[0] > 0.0:
@@ -289,7 +291,9 @@ def measure_cell_excess(
 
 
 @kernel
-def sum_over_cells(cells: CellArrays, nodes: Nodes, count: ti.i32, arity: ti.template(), share: Share) -> Results:
+def sum_over_cells(
+    cells: CellArrays, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
+) -> Results:
     """Largest strain of triangles along warp and weft; elastic energy."""
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
@@ -299,8 +303,8 @@ def sum_over_cells(cells: CellArrays, nodes: Nodes, count: ti.i32, arity: ti.tem
         for k in range(share.items):
             s = lane * share.lane_step + k * share.item_step
             if s < count:
-                d_u = derivative(cells.along, cells, nodes, s, arity)
-                d_v = derivative(cells.across, cells, nodes, s, arity)
+                d_u = derivative(cells.along, cells, nodes, carry, s, arity)
+                d_v = derivative(cells.across, cells, nodes, carry, s, arity)
                 law = cells.law[s]
                 shear, _ = shear_of(d_u, d_v)
                 energy += 0.5 * law[1] * shear * shear

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import Contraction, Nodes, SpringArrays
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.springs import Springs
-from sim.core.arrays import Integers
+from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
 
@@ -101,14 +101,14 @@ class DeviceSprings:
         stretches: NDArray[np.float64] = np.linalg.norm(d, axis=1) - self.host.rest
         return stretches
 
-    def contract(self, nodes: Nodes) -> None:
-        """Let springs of threads feel the strain across, as nodes are displaced now: with tensions C (e_u + nu e_v).
+    def contract(self, nodes: Nodes, displacement: ti.Ndarray) -> None:
+        """Let springs of threads feel the strain across, as nodes are displaced: with tensions C (e_u + nu e_v).
 
         A spring of a thread along x takes the mean of those along y that start or end at its two nodes: then each pair
         of them has the energy C nu e_x e_y of the sheet in the corner of a cell between them.
         """
         if self.contracts:
-            measure_contraction(self.on_device, self._contraction, nodes, self.count)
+            measure_contraction(self.on_device, self._contraction, nodes, displacement, self.count)
 
     def energy(self, positions: NDArray[np.float64]) -> float:
         """Elastic energy [J], in float64."""
@@ -145,15 +145,15 @@ def colour_groups(colours: NDArray[np.int32], starts: NDArray[np.integer], count
 
 
 @kernel
-def measure_contraction(springs: SpringArrays, contraction: Contraction, nodes: Nodes, count: ti.i32):
+def measure_contraction(
+    springs: SpringArrays, contraction: Contraction, nodes: Nodes, displacement: Vectors, count: ti.i32
+):
     """Shifts of springs from the strains of nodes; of these, two springs at most add to one, in either order."""
     for k in range(contraction.strain.shape[0]):
         contraction.strain[k] = 0.0
     for s in range(count):
         i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
-            nodes.displacement[i] - nodes.displacement[j]
-        )
+        d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (displacement[i] - displacement[j])
         strain = d.norm() / springs.law[s][0] - 1.0
         for end in ti.static((i, j)):
             place = 2 * end + contraction.axis[s]

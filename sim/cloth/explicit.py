@@ -70,7 +70,7 @@ class ExplicitSprings:
         """Give the springs' impulses of a step of dt [s] to the velocities."""
         state = self._state
         for first, springs in zip(self._first, self._springs, strict=False):
-            springs.contract(state.nodes)
+            springs.contract(state.nodes, state.carry)
             compute_spring_forces(
                 springs.on_device, state.nodes, state.motion, int(first), springs.count, springs.arity, self._force
             )

@@ -60,7 +60,7 @@ class ThreadSolver:
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
         springs = self._springs
-        springs.contract(state.nodes)
+        springs.contract(state.nodes, state.displacement)
         for colour in springs.first_colours:
             solve_threads(springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work)
 

@@ -51,7 +51,7 @@ class ClothTotals:
         """Elastic energy, and the largest strain along threads and triangles."""
         state, energy, strain = self._state, 0.0, 0.0
         for springs in self._springs:
-            springs.contract(state.nodes)
+            springs.contract(state.nodes, state.carry)
             results = self._of_springs.unpack(
                 sum_over_springs(
                     springs.on_device,
@@ -66,7 +66,12 @@ class ClothTotals:
         for cells in self._cells:
             results = self._of_springs.unpack(
                 sum_over_cells(
-                    cells.on_device, state.nodes, cells.count, cells.arity, self._of_springs.over(cells.count)
+                    cells.on_device,
+                    state.nodes,
+                    state.carry,
+                    cells.count,
+                    cells.arity,
+                    self._of_springs.over(cells.count),
                 )
             )
             strain, energy = max(strain, float(results[0])), energy + float(results[1])
