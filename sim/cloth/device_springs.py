@@ -63,7 +63,7 @@ class DeviceSprings:
         self.damping: NDArray[np.float64] = np.zeros(self.count)
         self.poisson: NDArray[np.float64] = np.zeros(self.count)
         self.is_damped = self.contracts = False
-        self.shift = ti.ndarray(ti.f32, self.count if self.in_segments else 1)
+        self.shift = ti.ndarray(ti.f32, self.count)
         self.shift.fill(0.0)
         if self.in_segments:
             places = 2 * springs.nodes + springs.kind[:, None]

@@ -114,9 +114,7 @@ def compute_spring_forces(
         value = ti.math.vec3(0.0)
         if length > TINY_LENGTH:
             direction = d / length
-            stretch = length - springs.law[s][0]
-            if ti.static(arity == 2):
-                stretch += springs.shift[s]
+            stretch = length - springs.law[s][0] + springs.shift[s]
             value = -springs.law[s][1] * (stretch + springs.law[s][2] * direction.dot(rate)) * direction
         force[first + s] = value
 

@@ -140,10 +140,7 @@ def sum_over_springs(
                 for a in ti.static(range(arity)):
                     d += coefficient(springs, s, arity, a) * carry[springs.nodes[arity * s + a]]
                 error = d.norm() - springs.law[s][0]
-                doubled = error * error
-                if ti.static(arity == 2):
-                    doubled += error * springs.shift[s]
-                energy += 0.5 * springs.law[s][1] * doubled
+                energy += 0.5 * springs.law[s][1] * error * (error + springs.shift[s])
                 if ti.static(arity == 2):
                     largest = ti.max(largest, error / springs.law[s][0])
         share.tree.partial[lane] = largest
