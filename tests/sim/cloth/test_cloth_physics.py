@@ -129,19 +129,19 @@ def test_a_taut_strip_does_not_jitter_across():
 
 @pytest.mark.slow
 def test_iterations_bring_springs_at_a_corner_to_what_short_steps_find():
-    """32 x 32 nodes of cotton hang from two corners; the truth are ten times as many steps."""
+    """64 x 64 nodes of cotton hang from two corners; the truth, 2 %, are ten times as many steps."""
     strains = {}
     for substeps, iterations in ((20, 1), (20, 4), (200, 1)):
         pins = [{"corner": "x-y+"}, {"corner": "x+y+"}]
         keys = {"pin": pins, "rotation_deg": (90, 0, 0), "substeps": substeps, "iterations": iterations}
-        solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (32, 32)), damping=2e-3, **keys, **VACUUM))
+        solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (64, 64)), damping=2e-3, **keys, **VACUUM))
         for _ in range(6):
             advance(solver, 0.1)
             solver.state.velocity.fill(0.0)
         strains[substeps, iterations] = solver.diagnostics()["max_strain"]
     errors = {key: strain - strains[200, 1] for key, strain in strains.items()}
-    assert 0.0 < errors[20, 1] < 0.05
-    assert abs(errors[20, 4]) < 0.3 * errors[20, 1]
+    assert 0.1 < errors[20, 1] < 0.3
+    assert abs(errors[20, 4]) < 0.01 * errors[20, 1]
 
 
 @pytest.mark.parametrize("pins", [[{"edge": "x-"}], [{"corner": "x-y-"}, {"corner": "x-y+"}]], ids=["edge", "corners"])
