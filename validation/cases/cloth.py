@@ -225,7 +225,9 @@ def _swinging_sheet(duration: float) -> dict[str, Any]:
             velocity = solver.state.velocity.to_numpy().astype(np.float64)
             positions = solver.state.positions() - 0.5 * dt * velocity
             moving = 0.5 * float(mass @ (velocity**2).sum(axis=1))
-            elastic = sum(family.energy(positions) for family in (*solver._springs, *solver._cells))
+            elastic = sum(each.energy(positions) for each in solver._springs) + sum(
+                each.energy(positions) for each in solver._cells
+            )
             times.append((step + 1) * dt)
             kinetic.append(moving / scale)
             energies.append((moving + elastic + GRAVITY * float(mass @ positions[:, 2])) / scale)
