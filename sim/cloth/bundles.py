@@ -60,6 +60,27 @@ class SpringArrays(NamedTuple):
     nodes: Integers  # (arity s,)
     law: Laws  # rest length [m], stiffness [N/m], damping over stiffness [s], (s,)
     coefficients: Floats  # of springs with four nodes, (4 s,)
+    shift: Floats  # what springs of threads count as longer, because of the strain across [m], (s,)
+
+
+@bundle
+class CellArrays(NamedTuple):
+    """Cells with as many nodes each, s of them."""
+
+    nodes: Integers  # (arity s,)
+    along: Floats  # c_a of d_u [1/m], (arity s,)
+    across: Floats  # c_a of d_v [1/m], (arity s,)
+    law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
+
+
+@bundle
+class Contraction(NamedTuple):
+    """How springs of threads feel the strain across."""
+
+    axis: Integers  # along which a spring runs, (s,)
+    poisson: Floats  # ratio, (s,)
+    share: Floats  # of each spring in the strain of a node, along both axes, (2 n,)
+    strain: Floats  # of nodes along both axes, (2 n,)
 
 
 @bundle

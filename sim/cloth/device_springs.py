@@ -6,11 +6,12 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Nodes, SpringArrays
+from sim.cloth.bundles import Contraction, Nodes, SpringArrays
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.springs import Springs
-from sim.core.arrays import Integers
+from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
+from sim.core.launch import kernel
 
 COLOURS_AT_ONCE = 4
 """Colours that are loops of one kernel: a launch costs 20 us of the host, and every loop its time to compile."""
@@ -30,7 +31,10 @@ class DeviceSprings:
         nodes: (count * arity,) int32.
         coefficients: c_a of springs with four nodes, (count * 4,); those of the others are known.
         law: (rest length [m], stiffness [N/m], damping over stiffness [s]), (count,) vec3.
+        poisson: Poisson's ratio of the cloth that a spring of a thread belongs to [-], (count,).
         is_damped: whether any of them is.
+        contracts: whether any of them feels the strain across.
+        shift: what springs of threads count as longer by it [m], (count,).
         first_colours: first colour of each group of `COLOURS_AT_ONCE`; the last group may have empty ones.
         piece_of_colour: first piece of each colour, and number of pieces, (colours + 1,); a piece is one spring where
             springs are solved one by one.
@@ -54,20 +58,27 @@ class DeviceSprings:
         starts = np.flatnonzero(np.diff(springs.segment, prepend=-1)) if self.in_segments else np.arange(self.count)
         self.segment_start = ti.ndarray(ti.i32, len(starts) + 1)
         self.segment_start.from_numpy(np.append(starts, self.count).astype(np.int32))
-        firsts = np.flatnonzero(np.diff(springs.colour[starts], prepend=-1))
-        self.first_colours = range(0, len(firsts), COLOURS_AT_ONCE)
-        padding = [len(starts)] * (len(self.first_colours) * COLOURS_AT_ONCE + 1 - len(firsts))
-        firsts = np.concatenate([firsts, padding])
-        self.piece_of_colour = ti.ndarray(ti.i32, len(firsts))
-        self.piece_of_colour.from_numpy(firsts.astype(np.int32))
+        self.first_colours, self.piece_of_colour = colour_groups(springs.colour, starts, len(starts))
         self.stiffness: NDArray[np.float64] = np.zeros(self.count)
         self.damping: NDArray[np.float64] = np.zeros(self.count)
-        self.is_damped = False
+        self.poisson: NDArray[np.float64] = np.zeros(self.count)
+        self.is_damped = self.contracts = False
+        self.shift = ti.ndarray(ti.f32, self.count)
+        self.shift.fill(0.0)
+        if self.in_segments:
+            places = 2 * springs.nodes + springs.kind[:, None]
+            number = np.bincount(places.ravel(), minlength=2 * int(springs.nodes.max()) + 2)
+            self._share = 1.0 / np.maximum(number, 1)
+            poisson = ti.ndarray(ti.f32, self.count)
+            share, strain = (ti.ndarray(ti.f32, len(number)) for _ in range(2))
+            self._contraction = Contraction(ti.ndarray(ti.i32, self.count), poisson, share, strain)
+            self._contraction.axis.from_numpy(springs.kind)
+            self._contraction.share.from_numpy(self._share.astype(np.float32))
 
     @property
     def on_device(self) -> SpringArrays:
         """The springs for kernels."""
-        return SpringArrays(self.nodes, self.law, self.coefficients)
+        return SpringArrays(self.nodes, self.law, self.coefficients, self.shift)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
@@ -76,6 +87,11 @@ class DeviceSprings:
             self.stiffness[own] = self.host.stiffness(cloth)[own]
             self.damping[own] = self.host.damping(cloth)[own]
         self.is_damped = bool((self.stiffness * self.damping).any())
+        if self.in_segments:
+            self.poisson = np.array([cloth.poisson_ratio for cloth in cloths])[self._cloth_of]
+            self._contraction.poisson.from_numpy(self.poisson.astype(np.float32))
+            self.contracts = bool(self.poisson.any())
+            self.shift.fill(0.0)
         law = np.stack([self.host.rest, self.stiffness, self.damping], axis=1)
         self.law.from_numpy(law.astype(np.float32))
 
@@ -85,9 +101,68 @@ class DeviceSprings:
         stretches: NDArray[np.float64] = np.linalg.norm(d, axis=1) - self.host.rest
         return stretches
 
+    def contract(self, nodes: Nodes, displacement: ti.Ndarray) -> None:
+        """Let springs of threads feel the strain across, as nodes are displaced: with tensions C (e_u + nu e_v).
+
+        A spring of a thread along x takes the mean of those along y that start or end at its two nodes: then each pair
+        of them has the energy C nu e_x e_y of the sheet in the corner of a cell between them.
+        """
+        if self.contracts:
+            measure_contraction(self.on_device, self._contraction, nodes, displacement, self.count)
+
     def energy(self, positions: NDArray[np.float64]) -> float:
         """Elastic energy [J], in float64."""
-        return float((0.5 * self.stiffness * self.stretches(positions) ** 2).sum())
+        stretch = self.stretches(positions)
+        return float((0.5 * self.stiffness * stretch * (stretch + self._shifts(stretch))).sum())
+
+    def _shifts(self, stretch: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`contract` in float64 on the host [m], (count,)."""
+        if not self.contracts:
+            return np.zeros(self.count)
+        own = 2 * self.host.nodes + self.host.kind[:, None]
+        strain = self._share * np.bincount(
+            own.ravel(), weights=np.repeat(stretch / self.host.rest, 2), minlength=len(self._share)
+        )
+        across: NDArray[np.float64] = strain[own ^ 1].mean(axis=1)
+        return self.poisson * self.host.rest * across
+
+
+def colour_groups(colours: NDArray[np.int32], starts: NDArray[np.integer], count: int) -> tuple[range, ti.Ndarray]:
+    """First colour of each group of `COLOURS_AT_ONCE`; first piece of each colour, and number of pieces from there on.
+
+    Args:
+        colours: of springs or cells, sorted.
+        starts: first of them of each piece.
+        count: number of pieces.
+    """
+    firsts = np.flatnonzero(np.diff(colours[starts], prepend=-1))
+    groups = range(0, len(firsts), COLOURS_AT_ONCE)
+    padding = [count] * (len(groups) * COLOURS_AT_ONCE + 1 - len(firsts))
+    firsts = np.concatenate([firsts, padding])
+    piece_of_colour = ti.ndarray(ti.i32, len(firsts))
+    piece_of_colour.from_numpy(firsts.astype(np.int32))
+    return groups, piece_of_colour
+
+
+@kernel
+def measure_contraction(
+    springs: SpringArrays, contraction: Contraction, nodes: Nodes, displacement: Vectors, count: ti.i32
+):
+    """Shifts of springs from the strains of nodes; of these, two springs at most add to one, in either order."""
+    for k in range(contraction.strain.shape[0]):
+        contraction.strain[k] = 0.0
+    for s in range(count):
+        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+        d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (displacement[i] - displacement[j])
+        strain = d.norm() / springs.law[s][0] - 1.0
+        for end in ti.static((i, j)):
+            place = 2 * end + contraction.axis[s]
+            ti.atomic_add(contraction.strain[place], contraction.share[place] * strain)
+    for s in range(count):
+        other = 1 - contraction.axis[s]
+        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+        across = 0.5 * (contraction.strain[2 * i + other] + contraction.strain[2 * j + other])
+        springs.shift[s] = contraction.poisson[s] * springs.law[s][0] * across
 
 
 @func

@@ -7,6 +7,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
+from sim.cloth.device_cells import DeviceCells, compute_cell_forces
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.stable_step import longest_explicit_step
@@ -22,18 +23,24 @@ class ExplicitSprings:
     node gathers its own in a fixed order.
     """
 
-    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
-        self._state, self._springs = state, springs
-        counts = [family.count for family in springs]
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
+        self._state, self._springs, self._cells = state, springs, cells
+        counts = [family.count for family in springs] + [2 * family.count for family in cells]
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
-        nodes = np.concatenate([family.host.nodes.ravel() for family in springs])
+        acting = [(family.host.nodes, family.host.coefficients) for family in springs]
+        for family in cells:  # two forces each, which act along d_u and d_v
+            host = family.host
+            acting.append(
+                (np.repeat(host.nodes, 2, axis=0), np.stack([host.along, host.across], axis=1).reshape(-1, host.arity))
+            )
+        nodes = np.concatenate([nodes.ravel() for nodes, _ in acting])
         spring = np.concatenate(
             [
-                np.repeat(first + np.arange(family.count), family.arity)
-                for first, family in zip(self._first[:-1], springs, strict=True)
+                np.repeat(first + np.arange(len(nodes)), nodes.shape[1])
+                for first, (nodes, _) in zip(self._first[:-1], acting, strict=True)
             ]
         )
-        coefficients = np.concatenate([family.host.coefficients.ravel() for family in springs])
+        coefficients = np.concatenate([coefficients.ravel() for _, coefficients in acting])
         order = np.argsort(nodes, kind="stable")
         start = np.searchsorted(nodes[order], np.arange(state.vertex_count + 1))
         self._start = _integers(start)
@@ -55,15 +62,21 @@ class ExplicitSprings:
 
     def stable_dt(self) -> float:
         """Longest stable step [s]."""
-        families = [(each.host, each.stiffness, each.damping) for each in self._springs]
-        return longest_explicit_step(families, self._state.inverse_mass.to_numpy())
+        families = [(each.host, (1.0 + each.poisson) * each.stiffness, each.damping) for each in self._springs]
+        cells = [(each.host, each.law) for each in self._cells]
+        return longest_explicit_step(families, cells, self._state.inverse_mass.to_numpy())
 
     def accelerate(self, dt: float) -> None:
         """Give the springs' impulses of a step of dt [s] to the velocities."""
         state = self._state
-        for first, springs in zip(self._first[:-1], self._springs, strict=True):
+        for first, springs in zip(self._first, self._springs, strict=False):
+            springs.contract(state.nodes, state.carry)
             compute_spring_forces(
                 springs.on_device, state.nodes, state.motion, int(first), springs.count, springs.arity, self._force
+            )
+        for first, cells in zip(self._first[len(self._springs) :], self._cells, strict=False):
+            compute_cell_forces(
+                cells.on_device, state.nodes, state.motion, int(first), cells.count, cells.arity, self._force
             )
         gather_spring_forces(
             self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
@@ -104,9 +117,8 @@ def compute_spring_forces(
         value = ti.math.vec3(0.0)
         if length > TINY_LENGTH:
             direction = d / length
-            value = (
-                -springs.law[s][1] * (length - springs.law[s][0] + springs.law[s][2] * direction.dot(rate)) * direction
-            )
+            stretch = length - springs.law[s][0] + springs.shift[s]
+            value = -springs.law[s][1] * (stretch + springs.law[s][2] * direction.dot(rate)) * direction
         force[first + s] = value
 
 

@@ -18,6 +18,7 @@ MATERIALS: Mapping[Material, Mapping[str, float]] = {
         "mass_per_area": 0.15,
         "stretch_stiffness": 4.0e3,
         "shear_stiffness": 50.0,
+        "poisson_ratio": 0.0,
         "bend_stiffness": 8.0e-6,
         "thickness": 0.5e-3,
         "friction": 0.5,
@@ -26,6 +27,7 @@ MATERIALS: Mapping[Material, Mapping[str, float]] = {
         "mass_per_area": 0.07,
         "stretch_stiffness": 3.0e3,
         "shear_stiffness": 20.0,
+        "poisson_ratio": 0.0,
         "bend_stiffness": 2.5e-6,
         "thickness": 0.2e-3,
         "friction": 0.25,
@@ -34,6 +36,7 @@ MATERIALS: Mapping[Material, Mapping[str, float]] = {
         "mass_per_area": 0.40,
         "stretch_stiffness": 10.0e3,
         "shear_stiffness": 150.0,
+        "poisson_ratio": 0.0,
         "bend_stiffness": 60.0e-6,
         "thickness": 0.9e-3,
         "friction": 0.6,
@@ -42,12 +45,14 @@ MATERIALS: Mapping[Material, Mapping[str, float]] = {
         "mass_per_area": RUBBER_DENSITY * RUBBER_THICKNESS,
         "stretch_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS,
         "shear_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS / (2.0 * (1.0 + RUBBER_POISSON)),
+        "poisson_ratio": RUBBER_POISSON,
         "bend_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS**3 / (12.0 * _PLANE),
         "thickness": RUBBER_THICKNESS,
         "friction": 0.9,
     },
 }
-"""Mass per area [kg/m²], stretch and shear stiffness [N/m], bending rigidity [N m], thickness [m], friction [-].
+"""Mass per area [kg/m²], stretch and shear stiffness [N/m], Poisson's ratio [-], bending rigidity [N m], thickness [m],
+friction [-].
 
 Woven cloths lie within the ranges that Kawabata's instruments find at small loads (Kawabata 1980, "The standardization
 and analysis of hand evaluation"; Hu 2004, "Structure and mechanics of woven fabrics", ch. 4-6), here for a shirting of
@@ -74,6 +79,7 @@ MATERIAL_UNITS: Mapping[str, str] = {
     "mass_per_area": "kg/m²",
     "stretch_stiffness": "N/m",
     "shear_stiffness": "N/m",
+    "poisson_ratio": "-",
     "bend_stiffness": "N m",
     "thickness": "m",
     "friction": "-",

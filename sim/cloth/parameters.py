@@ -173,13 +173,16 @@ class ClothParameters(Parameters):
     mass_per_area: Positive = Field(default=0.15, description="Mass per area [kg/m²]; the material's if omitted.")
     stretch_stiffness: Positive = Field(
         default=4.0e3,
-        description="Tension per width over strain, along the threads of a rectangle or in any direction of a mesh "
-        "[N/m]: Young's modulus times thickness; the material's if omitted.",
+        description="Tension per width over strain, along warp or weft [N/m]: Young's modulus times thickness; the "
+        "material's if omitted. They run along x and y of a rectangle, and as most of the border of a mesh.",
     )
-    shear_stiffness: NonNegative | None = Field(
-        default=None,
-        description="Shear force per width over shear angle, of rectangles [N/m]; the material's if omitted. A mesh "
-        "has none of its own: it shears with 3/8 of its stretch stiffness, as its edges run in all directions.",
+    shear_stiffness: NonNegative = Field(
+        default=50.0,
+        description="Shear force per width over the angle between warp and weft [N/m]; the material's if omitted.",
+    )
+    poisson_ratio: Annotated[float, Field(ge=0.0, le=0.9)] = Field(
+        default=0.0,
+        description="Contraction across over strain, of a strip along warp or weft [-]; the material's if omitted.",
     )
     bend_stiffness: NonNegative = Field(
         default=8.0e-6,
@@ -238,19 +241,15 @@ class ClothParameters(Parameters):
         material = data.get("material", "cotton") if isinstance(data, dict) else None
         if not isinstance(material, str) or material not in MATERIALS:
             return data  # the field's own validation says what is wrong with it
-        defaults = dict(MATERIALS[material])
-        shape = data.get("shape")
-        if (shape.get("type") if isinstance(shape, dict) else getattr(shape, "type", None)) == "mesh":
-            del defaults["shear_stiffness"]
-        return {**defaults, **data}
+        return {**MATERIALS[material], **data}
+
+    @property
+    def plane_stiffness(self) -> float:
+        """Tension per width over strain along warp or weft of a sheet that cannot contract across [N/m]."""
+        return self.stretch_stiffness / (1.0 - self.poisson_ratio**2)
 
     @model_validator(mode="after")
     def _fits_its_sheet(self) -> Self:
-        if self.shear_stiffness is not None and not isinstance(self.shape, RectangleSheet):
-            raise ValueError(
-                f"shear_stiffness is for rectangles; a mesh shears with 3/8 of its stretch_stiffness, "
-                f"{0.375 * self.stretch_stiffness:g} N/m; remove it"
-            )
         if self.integrator == "explicit" and self.iterations is not None:
             raise ValueError(f'iterations = {self.iterations} has no meaning for integrator = "explicit"; remove it')
         for number, pin in enumerate(self.pin):

@@ -8,11 +8,11 @@ from sim.cloth.bundles import Lines
 from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, load_blocks, rectangle_of, row_blocks, store_blocks, strips_of
-from sim.cloth.row_springs import bend_lines, solve_diagonals
-from sim.cloth.row_threads import solve_lines, straighten_lines
+from sim.cloth.row_springs import bend_lines, solve_cells_in_rows
+from sim.cloth.row_threads import measure_lines, solve_lines, straighten_lines
 from sim.cloth.sheet import Grid
 from sim.cloth.spring_convergence import measure_excess_in_lines
-from sim.cloth.springs import bend_share, diagonal_share, line_widths
+from sim.cloth.springs import bend_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import is_short
@@ -43,7 +43,9 @@ class RectangleSprings:
     def __init__(self, state: ClothState, grid: Grid, first_node: int) -> None:
         self._state, self._grid = state, grid
         self._blocks = row_blocks(grid.columns, grid.rows)
-        self._multipliers = ti.Vector.ndarray(LANES, ti.f32, self._blocks.u_x.shape[0])
+        room = self._blocks.u_x.shape[0]
+        self._multipliers, self._cell_multipliers = (ti.Vector.ndarray(LANES, ti.f32, room) for _ in range(2))
+        self._strains = tuple(ti.Vector.ndarray(LANES, ti.f32, room) for _ in range(2))
         self._strips = (strips_of(grid.columns), strips_of(grid.rows))
         self._rectangle = rectangle_of(grid, first_node)
         lengths = (grid.rows, grid.columns)
@@ -54,7 +56,7 @@ class RectangleSprings:
         self._thread_stiffness, self._bend_stiffness = (
             tuple(ti.ndarray(ti.f32, strips * LANES) for strips in self._strips) for _ in range(2)
         )
-        self._diagonal_stiffness = self._bend_damping = 0.0
+        self._cell_stiffness = self._poisson = self._bend_damping = 0.0
         self._is_short = is_short(grid.columns * grid.rows, NODE_IN_ROWS_NS)
 
     def take_parameters(self, cloth: ClothParameters) -> None:
@@ -64,14 +66,15 @@ class RectangleSprings:
         for axis, ((lines, spacing), step) in enumerate(zip(across, self._steps, strict=True)):
             width = line_widths(lines, spacing)
             padding = np.zeros(self._strips[axis] * LANES - lines)
-            _fill(self._thread_stiffness[axis], cloth.stretch_stiffness * width / step, padding + 1.0)
+            _fill(self._thread_stiffness[axis], cloth.plane_stiffness * width / step, padding + 1.0)
             _fill(self._bend_stiffness[axis], cloth.bend_stiffness * bend_share(width, step), padding)
-        self._diagonal_stiffness = (cloth.shear_stiffness or 0.0) * diagonal_share(grid)
+        self._cell_stiffness = cloth.shear_stiffness * grid.step_x * grid.step_y
+        self._poisson = cloth.poisson_ratio
         self._bend_damping = cloth.bend_damping
 
     def displace(self, dt: float, sweeps: int) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps."""
-        state, grid, blocks, short = self._state, self._grid, self._blocks, self._is_short
+        state, blocks, short = self._state, self._blocks, self._is_short
         load_blocks(blocks, state.nodes, self._rectangle, short)
         for axis in (ALONG_X, ALONG_Y):
             bend_lines(
@@ -84,41 +87,47 @@ class RectangleSprings:
                 short,
             )
         for sweep in range(sweeps):
-            for parity in range(2):
-                solve_diagonals(
-                    blocks,
-                    parity,
-                    self._rectangle,
-                    self._diagonal_stiffness,
-                    float(np.hypot(grid.step_x, grid.step_y)),
-                    state.quantum,
-                    dt * dt,
-                    int(sweep == 0),
-                    short,
-                )
-            self._solve_threads(dt, is_first=sweep == 0)
+            self._sweep(dt, is_first=sweep == 0)
         for axis in (ALONG_X, ALONG_Y):
             straighten_lines(blocks, self._lines[axis], short)
         store_blocks(blocks, state.nodes, self._rectangle, short)
 
     def sweep(self, dt: float) -> None:
-        """Solve the threads once more, after contacts."""
+        """Solve the cells and threads once more, after contacts."""
         load_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
-        self._solve_threads(dt, is_first=False)
+        self._sweep(dt, is_first=False)
         store_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
 
-    def _solve_threads(self, dt: float, *, is_first: bool) -> None:
+    def _sweep(self, dt: float, *, is_first: bool) -> None:
+        state, grid, blocks, short = self._state, self._grid, self._blocks, self._is_short
+        for parity in range(2):
+            solve_cells_in_rows(
+                blocks,
+                parity,
+                self._rectangle,
+                ti.math.vec2(grid.step_x, grid.step_y),
+                self._cell_stiffness,
+                state.quantum,
+                dt * dt,
+                int(is_first),
+                self._cell_multipliers,
+                short,
+            )
+        for axis in (ALONG_X, ALONG_Y) if self._poisson > 0.0 else ():
+            measure_lines(blocks, self._lines[axis], self._steps[axis], state.quantum, self._strains[axis], short)
         for axis in (ALONG_X, ALONG_Y):
             solve_lines(
-                self._blocks,
+                blocks,
                 self._lines[axis],
                 self._thread_stiffness[axis],
                 self._steps[axis],
-                self._state.quantum,
+                state.quantum,
                 dt * dt,
                 int(is_first),
                 self._multipliers,
-                self._is_short,
+                self._poisson,
+                self._strains[1 - axis],
+                short,
             )
 
     def excess(self, dt: float) -> tuple[float, int]:
@@ -136,6 +145,8 @@ class RectangleSprings:
                 line_step,
                 self._thread_stiffness[axis],
                 self._steps[axis],
+                self._poisson,
+                self._strains[1 - axis],
                 state.nodes,
                 dt * dt,
             )

@@ -48,7 +48,6 @@ class RowBlocks:
         predicted_x, predicted_y, predicted_z: displacements before any spring acted, upright [m].
         inverse_mass: [1/kg].
         n_x, n_y, n_z, inverse_length, change, factor, tension: of the spring that leads on from the node.
-        diagonal_multiplier: of the diagonals of the cell above the node, upright; from `turned` on of the other ones.
         is_taut: whether piece p of the lines of strip s has tension to straighten, at `s * pieces + p`, and from
             `turned` on for turned ones.
         v_x, v_y, v_z, share, free_share: of the air's kernels: velocity [m/s], share in the force on any triangle, and
@@ -65,7 +64,6 @@ class RowBlocks:
         self.predicted_x, self.predicted_y, self.predicted_z = (_blocks(count) for _ in range(3))
         self.n_x, self.n_y, self.n_z, self.inverse_length = (_blocks(count) for _ in range(4))
         self.change, self.factor, self.tension = (_blocks(count) for _ in range(3))
-        self.diagonal_multiplier = _blocks(count)
         self.is_taut = ti.field(ti.i32, shape=count)
         # The air has done before springs start, and works in the same memory.
         self.v_x, self.v_y, self.v_z = self.predicted_x, self.predicted_y, self.predicted_z

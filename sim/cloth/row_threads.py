@@ -4,7 +4,15 @@ import taichi as ti
 
 from sim.cloth.bundles import Lines
 from sim.cloth.device_springs import TINY_LENGTH
-from sim.cloth.row_blocks import LANES, Block, Blocks, turn_displacements, turn_displacements_back, turn_strip
+from sim.cloth.row_blocks import (
+    LANES,
+    Block,
+    Blocks,
+    turn_displacements,
+    turn_displacements_back,
+    turn_strip,
+    turn_strip_back,
+)
 from sim.cloth.springs import SEGMENT_LENGTH
 from sim.cloth.threads import LEAST_ALIKE, STRAIGHTENED, TURNED_EXPLICITLY
 from sim.core.arrays import Floats
@@ -30,12 +38,14 @@ def solve_lines(
     dt_squared: ti.f32,
     is_first: ti.i32,
     multipliers: Blocks,
+    poisson: ti.f32,
+    across: Blocks,
     is_short: ti.template(),
 ):
     """The threads along one direction, piece by piece, even pieces first; arguments as of `bend_lines`.
 
     `rest` is the length of a spring [m]; `multipliers` of the spring that leads on from each node start at 0 if
-    `is_first`.
+    `is_first`; `across` are the strains at nodes along the other direction, if `poisson` is not 0.
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -65,6 +75,8 @@ def solve_lines(
                     is_first,
                     multipliers,
                     first + strip * pieces + piece,
+                    0.5 * poisson * rest,
+                    across,
                 )
         if along.is_turned:
             turn_displacements_back(blocks, strip, along.other_strips, along.strips)
@@ -72,7 +84,19 @@ def solve_lines(
 
 @ti.func
 def solve_pieces(
-    blocks: ti.template(), line, strips, start, stop, compliance, rest, quantum, is_first, multipliers: Blocks, number
+    blocks: ti.template(),
+    line,
+    strips,
+    start,
+    stop,
+    compliance,
+    rest,
+    quantum,
+    is_first,
+    multipliers: Blocks,
+    number,
+    contraction,
+    across: Blocks,
 ):
     """One piece of LANES threads exactly: the Thomas algorithm forth, then back, where nodes move."""
     n_x, n_y, n_z = Block(0.0), Block(0.0), Block(0.0)
@@ -85,7 +109,9 @@ def solve_pieces(
         p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
         q_x, q_y, q_z = blocks.lattice_x[b], blocks.lattice_y[b], blocks.lattice_z[b]
         multiplier = multipliers[a]
-        inverse_length, factor = Block(0.0), Block(0.0)
+        inverse_length, factor, shift = Block(0.0), Block(0.0), Block(0.0)
+        if contraction > 0.0:
+            shift = contraction * (across[a] + across[b])
         for at in range(LANES):
             s_x = quantum * ti.cast(p_x[at] - q_x[at], ti.f32)
             s_y = quantum * ti.cast(p_y[at] - q_y[at], ti.f32)
@@ -105,7 +131,7 @@ def solve_pieces(
             coupling = -w_a[at] * (m_x * n_x[at] + m_y * n_y[at] + m_z * n_z[at])  # n is of the spring before
             lower = coupling * inverse_pivot[at]
             pivot = 1.0 / (w_a[at] + w_b[at] + compliance[at] - coupling * lower)
-            solved[at] = (rest - length - compliance[at] * before - coupling * solved[at]) * pivot
+            solved[at] = (rest - shift[at] - length - compliance[at] * before - coupling * solved[at]) * pivot
             inverse_pivot[at] = pivot
             factor[at] = lower
             inverse_length[at] = inverse
@@ -153,6 +179,46 @@ def solve_pieces(
         a_z[at] += w_a[at] * after_z[at]
     blocks.u_x[head], blocks.u_y[head], blocks.u_z[head] = a_x, a_y, a_z
     blocks.is_taut[number] = ti.cast(largest.max() > 0.0, ti.i32)
+
+
+@kernel
+def measure_lines(
+    blocks: ti.template(), along: Lines, rest: ti.f32, quantum: ti.f32, strain: Blocks, is_short: ti.template()
+):
+    """Strains at the nodes of all lines along one direction, of the two springs there or the one, in both layouts."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for strip in range(along.strips):
+        first = 0
+        if along.is_turned:
+            first = blocks.turned
+            turn_displacements(blocks, strip, along.other_strips, along.strips)
+        before = Block(0.0)
+        for k in range(along.length):
+            a = first + strip + k * along.strips
+            after = Block(0.0)
+            if k + 1 < along.length:
+                b = a + along.strips
+                a_x, a_y, a_z = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a]
+                b_x, b_y, b_z = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b]
+                p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
+                q_x, q_y, q_z = blocks.lattice_x[b], blocks.lattice_y[b], blocks.lattice_z[b]
+                for at in range(LANES):
+                    d_x = quantum * ti.cast(p_x[at] - q_x[at], ti.f32) + (a_x[at] - b_x[at])
+                    d_y = quantum * ti.cast(p_y[at] - q_y[at], ti.f32) + (a_y[at] - b_y[at])
+                    d_z = quantum * ti.cast(p_z[at] - q_z[at], ti.f32) + (a_z[at] - b_z[at])
+                    after[at] = ti.sqrt(d_x * d_x + d_y * d_y + d_z * d_z) / rest - 1.0
+            weight = 0.5
+            if k == 0 or k + 1 == along.length:
+                weight = 1.0
+            strain[a] = weight * (before + after)
+            before = after
+        if along.is_turned:
+            turn_strip_back(strain, blocks.turned, strip, along.other_strips, along.strips)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for strip in range(ti.select(along.is_turned, 0, along.other_strips)):
+        turn_strip(strain, blocks.turned, strip, along.strips, along.other_strips)
 
 
 @kernel

@@ -26,6 +26,9 @@ FLAT_TRIANGLE = 1.0e-4
 MERGED = 1.0e-5
 """A vertex farther than this from its node, in diagonals of the mesh, was not merged into it but dropped."""
 
+DIRECTED = 0.2
+"""A border has a direction if so much of its length runs along or across it, more than aslant; that of a disc: none."""
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -52,6 +55,7 @@ class RestSheet:
         node_area: share of the area of each node [m²], (n,); sums to the area of the sheet.
         uv: coordinates on the sheet at rest [m], (n, 2), from 0: along the sides of a rectangle; of a mesh as it is
             seen along the shortest side of its bounding box.
+        warp: direction of the warp in each triangle, a unit vector, (k, 3); of a rectangle the x axis. See `warp_of`.
         node_of_vertex: node of each vertex of the mesh file, (m,) int32, -1 where no triangle uses it; of a rectangle
             the nodes themselves.
         grid: how it is divided if it is a rectangle.
@@ -62,6 +66,7 @@ class RestSheet:
     triangles: Indices
     node_area: NDArray[np.float64]
     uv: NDArray[np.float64]
+    warp: Vectors
     node_of_vertex: Indices
     grid: Grid | None = None
     warnings: tuple[str, ...] = ()
@@ -98,7 +103,10 @@ def rectangle(shape: RectangleSheet) -> RestSheet:
     share_x, share_y = np.ones(columns), np.ones(rows)
     share_x[[0, -1]] = share_y[[0, -1]] = 0.5
     node_area = grid.step_x * grid.step_y * share_x[i] * share_y[j]
-    return RestSheet(vertices, triangles.astype(np.int32), node_area, uv, np.arange(len(uv), dtype=np.int32), grid)
+    warp = np.tile([1.0, 0.0, 0.0], (len(triangles), 1))
+    return RestSheet(
+        vertices, triangles.astype(np.int32), node_area, uv, warp, np.arange(len(uv), dtype=np.int32), grid
+    )
 
 
 def sheet_of_triangles(vertices: Vectors, triangles: NDArray[np.integer], *, label: str) -> RestSheet:
@@ -149,8 +157,44 @@ def sheet_of_triangles(vertices: Vectors, triangles: NDArray[np.integer], *, lab
     axes = np.sort(np.argsort(extent)[1:])
     uv = merged[:, axes] - merged[:, axes].min(axis=0)
     return RestSheet(
-        merged, oriented.astype(np.int32), node_area, uv, _nodes_of(vertices, merged), warnings=tuple(warnings)
+        merged,
+        oriented.astype(np.int32),
+        node_area,
+        uv,
+        warp_of(merged, oriented, axes),
+        _nodes_of(vertices, merged),
+        warnings=tuple(warnings),
     )
+
+
+def warp_of(vertices: Vectors, triangles: NDArray[np.integer], axes: NDArray[np.integer]) -> Vectors:
+    """Along the threads of a cloth that was cut straight: the direction in which most of its border runs, or at a right
+    angle to it, whichever is nearer to the first axis; that axis itself if the border has no direction.
+
+    In a curved sheet it is that direction projected onto each triangle, or at a right angle to the projection of the
+    other one, whichever of the two is longer. As warp and weft are alike, they may change places.
+
+    Args:
+        vertices: [m], (n, 3).
+        triangles: (k, 3).
+        axes: numbers of the two axes along which the sheet is longest.
+    """
+    sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    ends, count = np.unique(sides, axis=0, return_counts=True)
+    border = ends[count == 1]
+    x, y = (vertices[border[:, 1]] - vertices[border[:, 0]])[:, axes].T
+    along, length = x + 1j * y, np.hypot(x, y)
+    turned = (along**4 / np.maximum(length, SMALLEST_LENGTH * 1e-6) ** 3).sum()  # the same for all four directions
+    angle = 0.25 * np.angle(turned) if abs(turned) > DIRECTED * length.sum() else 0.0
+    first, second = np.zeros((2, 3))
+    first[axes], second[axes] = (np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    is_first = (np.abs(normal @ first) <= np.abs(normal @ second))[:, None]
+    warp = np.where(is_first, first - (normal @ first)[:, None] * normal, np.cross(second, normal))
+    unit: Vectors = warp / np.linalg.norm(warp, axis=1, keepdims=True)
+    return unit
 
 
 def _drop_second_sides(triangles: NDArray[np.int64]) -> NDArray[np.int64]:

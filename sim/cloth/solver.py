@@ -8,7 +8,9 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir
+from sim.cloth.cells import cells_of
 from sim.cloth.contacts import ClothContacts
+from sim.cloth.device_cells import DeviceCells
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
 from sim.cloth.load import NodeLoad
@@ -27,7 +29,7 @@ from sim.cloth.pins import Pins
 from sim.cloth.rectangles import rectangles_in_rows
 from sim.cloth.row_air import RectangleAir
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import joined_springs, springs_of
+from sim.cloth.springs import joined_cells, joined_springs, springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
 from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
@@ -55,6 +57,7 @@ LIVE_KEYS = frozenset(
         "mass_per_area",
         "stretch_stiffness",
         "shear_stiffness",
+        "poisson_ratio",
         "bend_stiffness",
         "damping",
         "bend_damping",
@@ -119,10 +122,15 @@ class ClothSolver:
         self.load: NodeLoad | None = None
         shared = self.parameters[0]
         apart = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
-        families = joined_springs([springs_of(sheet) for sheet in sheets], host.first_node.tolist(), apart=apart)
+        first = host.first_node.tolist()
+        families = joined_springs([springs_of(sheet) for sheet in sheets], first, apart=apart)
         self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
-        self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs)
-        self._totals = ClothTotals(self.state, self._springs)
+        self._cells = [
+            DeviceCells(cells, cloth_of)
+            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first, apart=apart)
+        ]
+        self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
+        self._totals = ClothTotals(self.state, self._springs, self._cells)
         self._frame_dt = 1.0 / frames_per_second
         self._is_short = is_short(self.state.vertex_count, NODE_NS)
         self.air = ClothAir(self.state)
@@ -314,8 +322,8 @@ class ClothSolver:
         """Masses, surfaces, stiffness and air as the parameters have them now."""
         cloths = self.parameters
         self.state.set_material(cloths)
-        for springs in self._springs:
-            springs.set_material(cloths)
+        for family in (*self._springs, *self._cells):
+            family.set_material(cloths)
         self._integrator.take_parameters(cloths)
         self.air.take_parameters(cloths)
         for number, rectangle in self._rectangles_in_wind.items():

@@ -12,7 +12,7 @@ from sim.cloth.row_blocks import LANES, Blocks
 from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import runs_on_gpu
+from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -21,31 +21,44 @@ rubber sheet does that a heavy ball falls into; a bag of water that hangs from f
 
 @func
 def excess_of(
-    i: ti.i32, j: ti.i32, rest: ti.f32, stiffness: ti.f32, multiplier: ti.f32, nodes: Nodes, dt_squared: ti.f32
+    i: ti.i32,
+    j: ti.i32,
+    rest: ti.f32,
+    shift: ti.f32,
+    stiffness: ti.f32,
+    multiplier: ti.f32,
+    nodes: Nodes,
+    dt_squared: ti.f32,
 ) -> ti.f32:
-    """(|d| - rest + l/(k dt²)) / rest, nothing for a spring between two nodes that are held."""
+    """(|d| - rest + shift + l/(k dt²)) / rest, nothing for a spring between two nodes that are held."""
     d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
         nodes.displacement[i] - nodes.displacement[j]
     )
-    excess = (d.norm() - rest + multiplier / (stiffness * dt_squared)) / rest
+    excess = (d.norm() - rest + shift + multiplier / (stiffness * dt_squared)) / rest
     return ti.select(nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0, excess, 0.0)
 
 
 @kernel
 def measure_excess(
-    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32
-) -> ti.math.vec2:
+    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, share: Share
+) -> Results:
     """Largest excess of springs of threads in lists, and how many have not converged."""
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    largest, unconverged = 0.0, 0.0
-    for s in range(count):
-        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        excess = excess_of(i, j, springs.law[s][0], springs.law[s][1], multiplier[s], nodes, dt_squared)
-        ti.atomic_max(largest, excess)
-        if excess > LARGEST_RESIDUAL:
-            unconverged += 1.0
-    return ti.math.vec2(largest, unconverged)
+    for lane in range(share.tree.lanes):
+        largest, unconverged = 0.0, 0.0
+        for k in range(share.items):
+            s = lane * share.lane_step + k * share.item_step
+            if s < count:
+                i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+                excess = excess_of(
+                    i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
+                )
+                largest = ti.max(largest, excess)
+                if excess > LARGEST_RESIDUAL:
+                    unconverged += 1.0
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
+    return reduced_tree(share.tree)
 
 
 @kernel
@@ -59,6 +72,8 @@ def measure_excess_in_lines(
     line_step: ti.i32,
     stiffness: Floats,
     rest: ti.f32,
+    poisson: ti.f32,
+    across: Blocks,
     nodes: Nodes,
     dt_squared: ti.f32,
 ) -> ti.math.vec2:
@@ -73,6 +88,8 @@ def measure_excess_in_lines(
         node_step, line_step: from a node to the next one of its line, and to the same of the next line.
         stiffness: of the springs of each line [N/m].
         rest: length of a spring [m].
+        poisson: Poisson's ratio [-].
+        across: strains at nodes along the other direction, as the threads took them, if `poisson` is not 0.
         nodes: of all cloths.
         dt_squared: [s²].
     """
@@ -85,7 +102,11 @@ def measure_excess_in_lines(
                 block += turned
             i = first_node + line * line_step + k * node_step
             multiplier = multipliers[block][line % LANES]
-            excess = excess_of(i, i + node_step, rest, stiffness[line], multiplier, nodes, dt_squared)
+            shift = 0.0
+            if poisson > 0.0:
+                after = block + along.strips
+                shift = 0.5 * poisson * rest * (across[block][line % LANES] + across[after][line % LANES])
+            excess = excess_of(i, i + node_step, rest, shift, stiffness[line], multiplier, nodes, dt_squared)
             largest = ti.max(largest, excess)
             if excess > LARGEST_RESIDUAL:
                 unconverged += 1.0

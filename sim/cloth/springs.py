@@ -11,15 +11,11 @@ curvature, so that it has no stiffness at all against the first bit of bending, 
 Stiffness, so that a sheet does not depend on how finely it is divided (per width and per strain; w is the width that a
 spring stands for, half on the border):
 
-- stretch E [N/m]: k = E w / L along a rectangle's threads; k = E A / L² on edges of a mesh, where A is the area of its
-  triangles (Van Gelder 1998, "Approximate simulation of elastic membranes by triangulated spring meshes"). On a lattice
-  of equal triangles that is exact, with a Poisson ratio of 1/3.
-- shear G [N/m]: k = G L² / (2 dx dy) on both diagonals of a cell: under a shear angle g each changes by g dx dy / L.
+- stretch C [N/m]: k = C w / L along a rectangle's threads, where C is the stiffness of a sheet that cannot contract
+  across; shear, and meshes, are a matter of `cells`.
 - bending B [N m]: k = B w / L³ over a node, where |d| = L² times the curvature; k = B / A about an edge, with the
   cotangents of Bergou et al. 2006, "A quadratic bending model for inextensible surfaces", sec. 3, as c. Both give a
   cylinder its energy B/2 curvature² per area, exactly on lattices of squares (along the threads) and equal triangles.
-
-A sheet of square cells has the stretch stiffness E + G and half of G across, because its diagonals are stretched too.
 """
 
 from __future__ import annotations
@@ -31,16 +27,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.cloth.cells import Cells
 from sim.cloth.colouring import greedy_colours
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet, triangle_areas
-from sim.cloth.strands import strands_of
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-STRETCH, SHEAR, BEND = range(3)
-"""Which stiffness of the sheet a spring takes."""
+ALONG_X, ALONG_Y, BEND = range(3)
+"""Of a spring: a thread of a rectangle along x or y, or a bend."""
 
 SEGMENT_LENGTH = 1023
 """Springs of a thread that are solved at once, at most: with as many nodes as a block of a GPU has threads."""
@@ -54,10 +50,10 @@ class Springs:
         nodes: (m, arity) int32.
         coefficients: c_a, (m, arity).
         rest: length without loads [m], (m,).
-        share: stiffness over that of the sheet, (m,): [-] of stretch and shear, [1/m²] of bending.
-        kind: STRETCH, SHEAR or BEND, (m,).
+        share: stiffness over that of the sheet, (m,): [-] of threads, [1/m²] of bends.
+        kind: ALONG_X, ALONG_Y or BEND, (m,).
         colour: (m,).
-        segment: piece of a thread, or strand of a mesh, that the spring belongs to, -1 where springs are solved one by
+        segment: piece of a thread that the spring belongs to, -1 where springs are solved one by
             one, (m,). Springs of a piece follow one another, each from the last node of the one before, and have one
             colour.
     """
@@ -85,7 +81,7 @@ class Springs:
 
     def stiffness(self, cloth: ClothParameters) -> Floats:
         """k of each spring in a cloth [N/m], (m,)."""
-        sheet = (cloth.stretch_stiffness, cloth.shear_stiffness or 0.0, cloth.bend_stiffness)
+        sheet = (cloth.plane_stiffness, cloth.plane_stiffness, cloth.bend_stiffness)
         return self.share * np.array(sheet)[self.kind]
 
     def damping(self, cloth: ClothParameters) -> Floats:
@@ -96,31 +92,11 @@ class Springs:
 def springs_of(sheet: RestSheet) -> list[Springs]:
     """All springs of a sheet, in the order in which they are solved."""
     if sheet.grid is not None:
-        return [_grid_bends(sheet.grid), _grid_diagonals(sheet.grid), _grid_threads(sheet.grid)]
-    return [_mesh_bends(sheet), _mesh_edges(sheet)]
+        return [_grid_bends(sheet.grid), _grid_threads(sheet.grid)]
+    return [_mesh_bends(sheet)]
 
 
 # --- rectangles ----------------------------------------------------------------------------------------------------
-
-
-def _grid_diagonals(grid: Grid) -> Springs:
-    """Both of each cell, those of every second row of cells first."""
-    number = _numbers(grid)
-    length = float(np.hypot(grid.step_x, grid.step_y))
-    row = np.broadcast_to(np.arange(grid.rows - 1)[:, None], (grid.rows - 1, grid.columns - 1)) % 2
-    share = diagonal_share(grid)
-    ends = [(number[:-1, :-1], number[1:, 1:]), (number[:-1, 1:], number[1:, :-1])]
-    nodes = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in ends])
-    count = len(nodes)
-    return Springs(
-        nodes,
-        np.tile([1.0, -1.0], (count, 1)),
-        np.full(count, length),
-        np.full(count, share),
-        _all(SHEAR, count),
-        np.concatenate([2 * row.ravel(), 2 * row.ravel() + 1]).astype(np.int32),
-        _all(-1, count),
-    )
 
 
 def _grid_threads(grid: Grid) -> Springs:
@@ -140,7 +116,7 @@ def _grid_threads(grid: Grid) -> Springs:
                 np.tile([1.0, -1.0], (count, 1)),
                 np.full(count, step),
                 (width / step).ravel(),
-                _all(STRETCH, count),
+                _all((ALONG_X, ALONG_Y)[axis], count),
                 colour.ravel().astype(np.int32),
                 segment.ravel().astype(np.int32),
             )
@@ -183,11 +159,6 @@ def bend_share(width: Floats, step: float) -> Floats:
     return share
 
 
-def diagonal_share(grid: Grid) -> float:
-    """Stiffness of a diagonal over that of the sheet against shear [-]."""
-    return (grid.step_x**2 + grid.step_y**2) / (2.0 * grid.step_x * grid.step_y)
-
-
 def _directions(grid: Grid) -> list[tuple[int, Indices, float, float]]:
     """Of x and y: number of the axis, nodes of each thread (threads, nodes), their distance, that of threads [m]."""
     number = _numbers(grid)
@@ -203,24 +174,6 @@ def _all(value: int, count: int) -> Indices:
 
 
 # --- meshes --------------------------------------------------------------------------------------------------------
-
-
-def _mesh_edges(sheet: RestSheet) -> Springs:
-    """One along each edge, strand by strand."""
-    edges, triangle_area = edges_of(sheet.triangles), triangle_areas(sheet.vertices, sheet.triangles)
-    area = np.bincount(edges.of_side, weights=np.repeat(triangle_area, 3), minlength=len(edges.nodes))
-    number, nodes, strand, colour = strands_of(edges.nodes, sheet.vertices)
-    ends = sheet.vertices[nodes]
-    rest = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    return Springs(
-        nodes,
-        np.tile([1.0, -1.0], (len(rest), 1)),
-        rest,
-        area[number] / rest**2,
-        _all(STRETCH, len(rest)),
-        colour,
-        strand,
-    )
 
 
 def _mesh_bends(sheet: RestSheet) -> Springs:
@@ -306,13 +259,37 @@ def joined_springs(
     return joined
 
 
-def _joined(parts: list[Springs]) -> Springs:
+def joined_cells(
+    parts: list[Cells], node_offsets: list[int], *, apart: Collection[int] = ()
+) -> list[tuple[Cells, Indices]]:
+    """Cells of several cloths, those with as many nodes together and sorted by colour, and the cloth of each.
+
+    Args:
+        parts: the cells of each cloth.
+        node_offsets: number of its first node.
+        apart: cloths whose cells are not joined with those of the others.
+    """
+    families: dict[tuple[bool, int], list[int]] = {}
+    for number, cells in enumerate(parts):
+        families.setdefault((number in apart, cells.arity), []).append(number)
+    joined = []
+    for key in sorted(families):
+        own = families[key]
+        moved = [replace(parts[n], nodes=(parts[n].nodes + node_offsets[n]).astype(np.int32)) for n in own]
+        cloth_of = np.concatenate([_all(number, len(parts[number])) for number in own])
+        cells = _joined(moved)
+        order = np.argsort(cells.colour, kind="stable")
+        joined.append((_mapped(lambda array, rows=order: array[rows], cells), cloth_of[order]))
+    return joined
+
+
+def _joined(parts: list[Any]) -> Any:
     return _mapped(lambda *arrays: np.concatenate(arrays), *parts)
 
 
-def _mapped(function: Callable[..., Any], *parts: Springs) -> Springs:
-    """Springs whose arrays are a function of those of others."""
-    return Springs(*(function(*(getattr(part, field.name) for part in parts)) for field in fields(Springs)))
+def _mapped(function: Callable[..., Any], *parts: Any) -> Any:
+    """Springs or cells whose arrays are a function of those of others."""
+    return type(parts[0])(*(function(*(getattr(part, field.name) for part in parts)) for field in fields(parts[0])))
 
 
 def _cotangent(first: Floats, second: Floats) -> Floats:

@@ -9,7 +9,7 @@ from sim.cloth.spring_convergence import measure_excess
 from sim.cloth.state import ClothState
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import runs_on_gpu
+from sim.core.reductions import LaneReduction, runs_on_gpu
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
@@ -61,6 +61,7 @@ class ThreadSolver:
         )
         self._pieces.piece.from_numpy(np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts)))
         self._pieces.spring_of_colour.from_numpy(starts[springs.piece_of_colour.to_numpy()])
+        self._excess = LaneReduction(maxima=1, sums=1)
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
             self._rows *= 2
@@ -68,6 +69,7 @@ class ThreadSolver:
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
         springs = self._springs
+        springs.contract(state.nodes, state.displacement)
         for colour in springs.first_colours:
             arguments = (springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work)
             if runs_on_gpu():
@@ -93,8 +95,9 @@ class ThreadSolver:
     def excess(self, state: ClothState, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
         springs = self._springs
-        largest, count = measure_excess(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt)
-        return float(largest), int(count)
+        share = self._excess.over(springs.count)
+        found = measure_excess(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, share)
+        return float(found[0]), int(found[1])
 
 
 @ti.func
@@ -142,7 +145,7 @@ def solve_threads(
             work.tension[s] = 1.0 / length
             at_start = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
             work.direction[s] = direction_of(at_start, d / length)
-            work.change[s] = springs.law[s][0] - length - compliance * work.multiplier[s]
+            work.change[s] = springs.law[s][0] - springs.shift[s] - length - compliance * work.multiplier[s]
             work.lower[s] = -nodes.inverse_mass[i]
             work.diagonal[s] = nodes.inverse_mass[i] + nodes.inverse_mass[j] + compliance
         for p in range(first_piece, end_piece):
@@ -314,7 +317,7 @@ def solve_threads_in_blocks(
             lower, diagonal, upper, missing = 0.0, 1.0, 0.0, 0.0
             if k < count:
                 diagonal = w_i + w_j + compliance
-                missing = springs.law[s][0] - length - compliance * before
+                missing = springs.law[s][0] - springs.shift[s] - length - compliance * before
                 if k > 0:
                     lower = -w_i * n.dot(ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1]))
                 if k + 1 < count:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import taichi as ti
 
 from sim.cloth.bundles import Lattice, Nodes, SpringArrays
+from sim.cloth.device_cells import DeviceCells, sum_over_cells
 from sim.cloth.device_springs import DeviceSprings, coefficient, separation
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Vectors
@@ -22,8 +23,8 @@ SPRING_MAXIMA, SPRING_SUMS = 1, 1
 class ClothTotals:
     """Momentum, energies and extremes, in float32 and in a fixed order."""
 
-    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
-        self._state, self._springs = state, springs
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
+        self._state, self._springs, self._cells = state, springs, cells
         self._of_nodes = LaneReduction(maxima=NODE_MAXIMA, sums=NODE_SUMS)
         self._of_springs = LaneReduction(maxima=SPRING_MAXIMA, sums=SPRING_SUMS)
 
@@ -47,9 +48,10 @@ class ClothTotals:
         return {"max_speed": math.sqrt(speed_squared), **dict(zip(names, sums, strict=True))}
 
     def of_springs(self) -> dict[str, float]:
-        """Elastic energy, and the largest strain of springs between two nodes."""
+        """Elastic energy, and the largest strain along threads and triangles."""
         state, energy, strain = self._state, 0.0, 0.0
         for springs in self._springs:
+            springs.contract(state.nodes, state.carry)
             results = self._of_springs.unpack(
                 sum_over_springs(
                     springs.on_device,
@@ -58,6 +60,18 @@ class ClothTotals:
                     springs.count,
                     springs.arity,
                     self._of_springs.over(springs.count),
+                )
+            )
+            strain, energy = max(strain, float(results[0])), energy + float(results[1])
+        for cells in self._cells:
+            results = self._of_springs.unpack(
+                sum_over_cells(
+                    cells.on_device,
+                    state.nodes,
+                    state.carry,
+                    cells.count,
+                    cells.arity,
+                    self._of_springs.over(cells.count),
                 )
             )
             strain, energy = max(strain, float(results[0])), energy + float(results[1])
@@ -126,7 +140,7 @@ def sum_over_springs(
                 for a in ti.static(range(arity)):
                     d += coefficient(springs, s, arity, a) * carry[springs.nodes[arity * s + a]]
                 error = d.norm() - springs.law[s][0]
-                energy += 0.5 * springs.law[s][1] * error * error
+                energy += 0.5 * springs.law[s][1] * error * (error + springs.shift[s])
                 if ti.static(arity == 2):
                     largest = ti.max(largest, error / springs.law[s][0])
         share.tree.partial[lane] = largest

@@ -6,14 +6,17 @@ import taichi as ti
 
 from sim.cloth.angular_momentum import AngularMomentumCorrection
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
+from sim.cloth.cells import TRIANGLE
+from sim.cloth.device_cells import DeviceCells, damp_cells, measure_cell_excess, solve_cells
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
-from sim.core.arrays import Floats, Integers
+from sim.core.arrays import Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
+from sim.core.reductions import LaneReduction
 
 PAIR, BEND_OF_GRID = 2, 3
 """Nodes of springs: of an ordinary one, and of one over a node of a rectangle, which is flat at rest."""
@@ -35,23 +38,21 @@ class XPBDSprings:
     Args:
         state: what they move.
         springs: all springs.
+        cells: all cells.
     """
 
-    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
-        self._state, self._springs = state, springs
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
+        self._state, self._springs, self._cells = state, springs, cells
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
+        self._of_cells = LaneReduction(maxima=1, sums=1)
         self._rectangles = {
             number: RectangleSprings(state, grid, int(state.host.first_node[number]))
             for number, grid in rectangles_in_rows(state.host).items()
         }
         listed = [family for family in springs if not family.cloths & self._rectangles.keys()]
         self._bends = [family for family in listed if family.arity > PAIR]
-        self._pairs = [
-            (family, ti.ndarray(ti.f32, family.count))
-            for family in listed
-            if family.arity == PAIR and not family.in_segments
-        ]
+        self._solved_cells = [family for family in cells if not family.cloths & self._rectangles.keys()]
         self._threads = [ThreadSolver(family) for family in listed if family.in_segments]
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
@@ -63,6 +64,13 @@ class XPBDSprings:
         """By how much a spring of threads and edges is longer than its tension makes it, at most [rest lengths]."""
         found = [threads.excess(self._state, dt) for threads in self._threads]
         found += [rectangle.excess(dt) for rectangle in self._rectangles.values()]
+        for cells in self._solved_cells:
+            if cells.arity == TRIANGLE:
+                share = self._of_cells.over(cells.count)
+                result = measure_cell_excess(
+                    cells.on_device, cells.count, cells.multiplier, self._state.nodes, dt * dt, share
+                )
+                found.append((float(result[0]), int(result[1])))
         self._unconverged = sum(count for _, count in found)
         return max((largest for largest, _ in found), default=0.0)
 
@@ -96,16 +104,19 @@ class XPBDSprings:
                     dt,
                     springs.arity,
                 )
+        for cells in self._cells:
+            if cells.is_damped:
+                for colour in cells.first_colours:
+                    damp_cells(
+                        cells.on_device, cells.cell_of_colour, colour, state.nodes, state.motion, dt, cells.arity
+                    )
 
     def displace(self, dt: float, sweeps: int) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps."""
         for springs in self._bends:
             self._solve_bends(springs, dt)
         for sweep in range(sweeps):
-            for springs, multiplier in self._pairs:
-                self._solve_pairs(springs, multiplier, dt, is_first=sweep == 0)
-            for threads in self._threads:
-                threads.displace(self._state, dt, is_first=sweep == 0)
+            self._sweep_lists(dt, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
         for rectangle in self._rectangles.values():
@@ -113,24 +124,32 @@ class XPBDSprings:
         self._momentum.restore(dt)
 
     def sweep(self, dt: float) -> None:
-        """Solve the threads and edges of the step once more, after contacts have pushed."""
-        for threads in self._threads:
-            threads.displace(self._state, dt, is_first=False)
+        """Solve the cells and threads of the step once more, after contacts have pushed."""
+        self._sweep_lists(dt, is_first=False)
         for rectangle in self._rectangles.values():
             rectangle.sweep(dt)
+
+    def _sweep_lists(self, dt: float, *, is_first: bool) -> None:
+        for cells in self._solved_cells:
+            for colour in cells.first_colours:
+                solve_cells(
+                    cells.on_device,
+                    cells.cell_of_colour,
+                    colour,
+                    self._state.nodes,
+                    dt * dt,
+                    int(is_first),
+                    cells.multiplier,
+                    cells.arity,
+                )
+        for threads in self._threads:
+            threads.displace(self._state, dt, is_first=is_first)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
         state = self._state
         for colour in springs.first_colours:
             solve_bends(
                 springs.on_device, springs.piece_of_colour, colour, state.nodes, dt * dt, 1.0 / dt, springs.arity
-            )
-
-    def _solve_pairs(self, springs: DeviceSprings, multiplier: ti.Ndarray, dt: float, *, is_first: bool) -> None:
-        state = self._state
-        for colour in springs.first_colours:
-            solve_pairs(
-                springs.on_device, springs.piece_of_colour, colour, state.nodes, dt * dt, int(is_first), multiplier
             )
 
 
@@ -183,43 +202,6 @@ def solve_bends(
     for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
         for s in range(start, stop):
             solve_bend(s, springs, nodes, dt_squared, rate, arity)
-
-
-@kernel
-def solve_pairs(
-    springs: SpringArrays,
-    spring_of_colour: Integers,
-    colour: ti.i32,
-    nodes: Nodes,
-    dt_squared: ti.f32,
-    is_first: ti.i32,
-    multiplier: Floats,
-):
-    """The springs between two nodes of some colours, one colour after the other.
-
-    Macklin, Müller & Chentanez 2016, eq. 18, Delta lambda = -(C + a lambda) / (w_i + w_j + a) with a = 1/(k dt²),
-    multiplied through by k dt²; multipliers start at 0 in every step.
-    """
-    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, colour)
-    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
-        for s in range(start, stop):
-            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-            w_i, w_j = nodes.inverse_mass[i], nodes.inverse_mass[j]
-            d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
-                nodes.displacement[i] - nodes.displacement[j]
-            )
-            length = ti.max(d.norm(), TINY_LENGTH)
-            strength = springs.law[s][1] * dt_squared
-            before = 0.0
-            if not is_first:
-                before = multiplier[s]
-            change = -(strength * (length - springs.law[s][0]) + before) / (
-                length * (strength * (w_i + w_j) + 1.0)
-            )  # over |d|
-            multiplier[s] = before + length * change
-            nodes.displacement[i] = nodes.displacement[i] + w_i * change * d
-            nodes.displacement[j] = nodes.displacement[j] - w_j * change * d
 
 
 @func

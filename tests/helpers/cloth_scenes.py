@@ -61,7 +61,7 @@ def angular_momentum(solver: ClothSolver) -> NDArray[np.float64]:
 
 
 def spring_energy(solver: ClothSolver) -> float:
-    return sum(springs.energy(solver.state.positions()) for springs in solver._springs)
+    return sum(family.energy(solver.state.positions()) for family in (*solver._springs, *solver._cells))
 
 
 def energy(solver: ClothSolver) -> float:
@@ -70,3 +70,32 @@ def energy(solver: ClothSolver) -> float:
     velocity = solver.state.velocity.to_numpy().astype(np.float64)
     kinetic = 0.5 * float(mass @ (velocity**2).sum(axis=1))
     return kinetic + spring_energy(solver) - float(mass @ (solver.state.positions() @ np.asarray(solver.gravity)))
+
+
+def irregular_square(
+    size: float | tuple[float, float], spacing: float
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """A square or rectangle about the origin of triangles of all shapes, with a vertex at the origin.
+
+    Args:
+        size: length of its sides [m].
+        spacing: of its vertices, about [m].
+    """
+    from scipy.spatial import Delaunay
+
+    sides = np.array(size if isinstance(size, tuple) else (size, size))
+    counts = np.round(sides / spacing).astype(int)
+    x, y = (np.linspace(-0.5, 0.5, count + 1) * side for count, side in zip(counts, sides, strict=True))
+    border = [(a, b) for b in (y[0], y[-1]) for a in x] + [(a, b) for a in (x[0], x[-1]) for b in y[1:-1]]
+    many = int(counts.max()) + 2
+    j, i = (each.ravel() for each in np.mgrid[-many : many + 1, -many : many + 1])
+    points = spacing * np.stack([i + 0.5 * (j % 2), j * np.sqrt(0.75)], axis=1)
+    points += spacing * np.random.default_rng(0).uniform(-0.2, 0.2, points.shape)
+    points[(i == 0) & (j == 0)] = 0.0
+    points = points[(np.abs(points) < 0.5 * sides - 0.45 * spacing).all(axis=1)]
+    vertices = np.concatenate([border, points])
+    triangles = Delaunay(vertices).simplices
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    area = 0.5 * np.abs(np.cross(b - a, c - a))
+    vertices = np.concatenate([vertices, np.zeros((len(vertices), 1))], axis=1)
+    return vertices, triangles[area > 0.02 * spacing**2].astype(np.int32)

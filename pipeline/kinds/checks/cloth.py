@@ -17,6 +17,7 @@ from pipeline.model.boxes import Box, domain_box, span, touch
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from sim.cloth.cells import cells_of
 from sim.cloth.parameters import RUNAWAY_SPEED, ClothParameters, RectangleSheet, shared_conflicts
 from sim.cloth.springs import springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, longest_explicit_step, too_few_substeps
@@ -126,10 +127,14 @@ def _check_substeps(start: ClothStart, fps: int, findings: Findings) -> None:
     cloth = start.cloth
     if cloth.integrator != "explicit":
         return
-    families = [(springs, springs.stiffness(cloth), springs.damping(cloth)) for springs in springs_of(start.sheet)]
+    families = [
+        (springs, (1.0 + cloth.poisson_ratio) * springs.stiffness(cloth), springs.damping(cloth))
+        for springs in springs_of(start.sheet)
+    ]
     # Nodes that are released later need shorter steps from then on.
     inverse_mass = np.where(start.held_for_ever, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
-    longest = longest_explicit_step(families, inverse_mass)
+    cells = cells_of(start.sheet)
+    longest = longest_explicit_step(families, [(cells, cells.law(cloth))], inverse_mass)
     if cloth.substeps is not None:
         if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest):
             findings.error((*start.path, "substeps"), reason)

@@ -51,7 +51,6 @@ def test_rubber_is_the_isotropic_sheet_that_its_docstring_says():
         ),
         ({"pin": [{"edge": "x-", "interpolation": "linear"}]}, "no meaning without keyframes"),
         ({"shape": {"type": "mesh", "file": "a.obj"}, "pin": [{"edge": "x-"}]}, "pin a mesh by index or region"),
-        ({"shape": {"type": "mesh", "file": "a.obj"}, "shear_stiffness": 3.0}, "shear_stiffness is for rectangles"),
         (
             {"integrator": "explicit", "iterations": 2},
             'iterations = 2 has no meaning for integrator = "explicit"; remove',

@@ -91,16 +91,16 @@ def test_a_mesh_hangs_as_far_down_as_its_stiffness_lets_it(tmp_path):
     path = tmp_path / "sheet.stl"
     trimesh.Trimesh(vertices, triangles, process=False).export(path)
     top = {"type": "box", "min": (-1, -1, 0.499), "max": (1, 1, 0.501)}
-    keys = {"bend_stiffness": 0.0, "damping": 2e-3, **VACUUM}
+    keys = {"bend_stiffness": 0.0, "damping": 2e-3, "substeps": 200, **VACUUM}
     solver = solver_of(cloth(shape={"type": "mesh", "file": str(path)}, pin=[{"region": top}], **keys))
     start = solver.state.positions()
-    settle(solver, 12, 40)
+    settle(solver, 12, 400)
     x = solver.state.positions()
     lowest = start[:, 2] < -0.499
     inner = lowest & (np.abs(start[:, 0]) < 0.25)
     longer = (start[inner, 2] - x[inner, 2]).mean()
-    # Sheets held along an edge cannot become narrower there, and borders are loose: some 5 % each. Springs that are
-    # solved one by one instead of in strands make it 25 times as much.
+    # Triangles are solved one by one: a metre gets 1.4 mm longer at 20 steps, and what is too much of it falls with the
+    # square of the step.
     assert longer == pytest.approx(0.15 * GRAVITY / (2.0 * 4000.0), rel=0.15)
 
 
@@ -126,19 +126,19 @@ def test_a_taut_strip_does_not_jitter_across():
 
 @pytest.mark.slow
 def test_iterations_bring_springs_at_a_corner_to_what_short_steps_find():
-    """32 x 32 nodes of cotton hang from two corners; the truth are ten times as many steps."""
+    """64 x 64 nodes of cotton hang from two corners; the truth, 2 %, are ten times as many steps."""
     strains = {}
     for substeps, iterations in ((20, 1), (20, 4), (200, 1)):
         pins = [{"corner": "x-y+"}, {"corner": "x+y+"}]
         keys = {"pin": pins, "rotation_deg": (90, 0, 0), "substeps": substeps, "iterations": iterations}
-        solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (32, 32)), damping=2e-3, **keys, **VACUUM))
+        solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (64, 64)), damping=2e-3, **keys, **VACUUM))
         for _ in range(6):
             advance(solver, 0.1)
             solver.state.velocity.fill(0.0)
         strains[substeps, iterations] = solver.diagnostics()["max_strain"]
     errors = {key: strain - strains[200, 1] for key, strain in strains.items()}
-    assert 0.0 < errors[20, 1] < 0.05
-    assert abs(errors[20, 4]) < 0.3 * errors[20, 1]
+    assert 0.1 < errors[20, 1] < 0.3
+    assert abs(errors[20, 4]) < 0.01 * errors[20, 1]
 
 
 @pytest.mark.parametrize("pins", [[{"edge": "x-"}], [{"corner": "x-y-"}, {"corner": "x-y+"}]], ids=["edge", "corners"])
@@ -176,7 +176,7 @@ def test_energy_of_an_undamped_sheet_that_swings_for_ten_seconds_does_not_drift(
             velocity = solver.state.velocity.to_numpy().astype(np.float64)
             positions = solver.state.positions() - 0.5 * dt * velocity
             kinetic = 0.5 * mass @ (velocity**2).sum(axis=1)
-            elastic = sum(springs.energy(positions) for springs in solver._springs)
+            elastic = sum(family.energy(positions) for family in (*solver._springs, *solver._cells))
             energies.append(kinetic + elastic + GRAVITY * float(mass @ positions[:, 2]))
     assert np.abs(energies).max() < 0.01 * mass.sum() * GRAVITY * 0.1
     assert solver.diagnostics()["kinetic_energy"] > 0.2 * mass.sum() * GRAVITY * 0.1  # it still moves

@@ -95,7 +95,7 @@ def test_cloth_on_a_tip_gains_no_energy_and_does_not_stretch():
         substeps.append(world.advance_frame().substeps["cloth"])
         energies.append(energy(solver))
         strains.append(solver.diagnostics()["max_strain"])
-    assert max(energies) < 1.02 * start
+    assert max(energies) < 1.05 * start
     assert max(strains) < 0.2
     assert substeps[0] == DEFAULT_SUBSTEPS < max(substeps)
 

@@ -1,0 +1,321 @@
+"""Cells on the device, with the law that the parameters of the moment give them, for XPBD and explicit steps."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cloth.bundles import CellArrays, NodeMotion, Nodes
+from sim.cloth.cells import STRAINS, TRIANGLE, Cells, energies
+from sim.cloth.device_springs import TINY_LENGTH, colour_bounds, colour_groups
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.spring_convergence import LARGEST_RESIDUAL
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
+
+Six = ti.types.vector(6, ti.f32)
+
+
+class DeviceCells:
+    """Cells with as many nodes each, sorted by colour.
+
+    Attributes:
+        host: the cells on the host.
+        arity: nodes of a cell.
+        count: number of cells.
+        law: as `Cells.law` has it, (count, 4).
+        cloths: numbers of the cloths that they belong to.
+        first_colours: first colour of each group of `COLOURS_AT_ONCE`; the last group may have empty ones.
+        cell_of_colour: first cell of each colour, and number of cells, (colours + 1,).
+        multiplier: of each strain, (count * STRAINS,).
+    """
+
+    def __init__(self, cells: Cells, cloth_of: NDArray[np.int32]) -> None:
+        self.host, self._cloth_of = cells, cloth_of
+        self.cloths = frozenset(np.unique(cloth_of).tolist())
+        self.arity, self.count = cells.arity, len(cells)
+        self.law: NDArray[np.float64] = np.zeros((self.count, 4))
+        self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
+        self.multiplier = ti.ndarray(ti.f32, self.count * STRAINS)
+        nodes, along, across = (ti.ndarray(kind, self.count * self.arity) for kind in (ti.i32, ti.f32, ti.f32))
+        nodes.from_numpy(np.ascontiguousarray(cells.nodes).ravel())
+        along.from_numpy(cells.along.astype(np.float32).ravel())
+        across.from_numpy(cells.across.astype(np.float32).ravel())
+        self.on_device = CellArrays(nodes, along, across, ti.Vector.ndarray(4, ti.f32, self.count))
+
+    @property
+    def is_damped(self) -> bool:
+        """Whether any of them is."""
+        return bool((self.law[:, :2] * self.law[:, 3:]).any())
+
+    def set_material(self, cloths: Sequence[ClothParameters]) -> None:
+        """Take stiffness and damping from the cloths' parameters."""
+        for number, cloth in enumerate(cloths):
+            own = self._cloth_of == number
+            self.law[own] = self.host.law(cloth)[own]
+        self.on_device.law.from_numpy(self.law.astype(np.float32))
+
+    def energy(self, positions: NDArray[np.float64]) -> float:
+        """Elastic energy [J], in float64."""
+        return float(energies(self.host.strains(positions), self.law).sum())
+
+
+@func
+def derivative(
+    coefficients: Floats, cells: CellArrays, nodes: Nodes, displacement: Vectors, s: ti.i32, arity: ti.template()
+) -> ti.math.vec3:
+    """sum_a c_a x_a displaced; from differences, exact in integers, as sum_a c_a = 0."""
+    d = ti.math.vec3(0.0)
+    moved = ti.math.vec3(0.0)
+    first = nodes.lattice[cells.nodes[arity * s]]
+    for a in ti.static(range(arity)):
+        i = cells.nodes[arity * s + a]
+        c_a = coefficients[arity * s + a]
+        if ti.static(a > 0):
+            d += c_a * ti.cast(nodes.lattice[i] - first, ti.f32)
+        moved += c_a * displacement[i]
+    return nodes.quantum * d + moved
+
+
+@func
+def velocity_derivative(coefficients: Floats, cells: CellArrays, motion: NodeMotion, s: ti.i32, arity: ti.template()):
+    """sum_a c_a v_a [1/s]."""
+    rate = ti.math.vec3(0.0)
+    for a in ti.static(range(arity)):
+        rate += coefficients[arity * s + a] * motion.velocity[cells.nodes[arity * s + a]]
+    return rate
+
+
+@func
+def weights(cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()) -> ti.math.vec3:
+    """sum_a w_a c_a c'_a: of d_u with itself, of d_v with itself, of both [1/(kg m²)]."""
+    total = ti.math.vec3(0.0)
+    for a in ti.static(range(arity)):
+        w_a = nodes.inverse_mass[cells.nodes[arity * s + a]]
+        u, v = cells.along[arity * s + a], cells.across[arity * s + a]
+        total += w_a * ti.math.vec3(u * u, v * v, u * v)
+    return total
+
+
+@ti.func
+def shear_of(d_u: ti.math.vec3, d_v: ti.math.vec3):
+    """e_s, and its derivatives by d_u and d_v, (6,)."""
+    more, less = d_u + d_v, d_u - d_v
+    length, length_less = ti.max(more.norm(), TINY_LENGTH), ti.max(less.norm(), TINY_LENGTH)
+    n, m = more / length, less / length_less
+    half = ti.sqrt(0.5)
+    by_u, by_v = half * (n - m), half * (n + m)
+    return half * (length - length_less), Six(by_u[0], by_u[1], by_u[2], by_v[0], by_v[1], by_v[2])
+
+
+@func
+def solve_cell(
+    s: ti.i32,
+    cells: CellArrays,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    multiplier: Floats,
+    arity: ti.template(),
+):
+    """Strain by strain, Macklin, Müller & Chentanez 2016, eq. 18, multiplied through by k dt².
+
+    With nu times the strain across, warp and weft have the tension C (e_u + nu e_v): each takes the other as it is.
+    """
+    d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, arity)
+    d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, arity)
+    w = weights(cells, nodes, s, arity)
+    p_u, p_v = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    law = cells.law[s]
+    if ti.static(arity == TRIANGLE):
+        strength = law[0] * dt_squared
+        length, length_across = ti.max(d_u.norm(), TINY_LENGTH), d_v.norm()
+        before = ti.select(is_first, 0.0, multiplier[STRAINS * s])
+        strain = length - 1.0 + law[2] * (length_across - 1.0)
+        change = -(strength * strain + before) / (strength * w[0] + 1.0)
+        multiplier[STRAINS * s] = before + change
+        p_u = change / length * d_u
+        d_v += w[2] * p_u
+        d_u += w[0] * p_u
+        length, length_across = d_u.norm(), ti.max(d_v.norm(), TINY_LENGTH)
+        before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 1])
+        strain = length_across - 1.0 + law[2] * (length - 1.0)
+        change = -(strength * strain + before) / (strength * w[1] + 1.0)
+        multiplier[STRAINS * s + 1] = before + change
+        p_v = change / length_across * d_v
+        d_u += w[2] * p_v
+        d_v += w[1] * p_v
+    shear, by = shear_of(d_u, d_v)
+    by_u, by_v = ti.math.vec3(by[0], by[1], by[2]), ti.math.vec3(by[3], by[4], by[5])
+    strength = law[1] * dt_squared
+    weight = w[0] * by_u.dot(by_u) + w[1] * by_v.dot(by_v) + 2.0 * w[2] * by_u.dot(by_v)
+    before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 2])
+    change = -(strength * shear + before) / (strength * weight + 1.0)
+    multiplier[STRAINS * s + 2] = before + change
+    p_u += change * by_u
+    p_v += change * by_v
+    for a in ti.static(range(arity)):
+        i = cells.nodes[arity * s + a]
+        push = cells.along[arity * s + a] * p_u + cells.across[arity * s + a] * p_v
+        nodes.displacement[i] = nodes.displacement[i] + nodes.inverse_mass[i] * push
+
+
+@kernel
+def solve_cells(
+    cells: CellArrays,
+    cell_of_colour: Integers,
+    colour: ti.i32,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    multiplier: Floats,
+    arity: ti.template(),
+):
+    """The cells of some colours, from `colour` on, one colour after the other; multipliers start at 0 if `is_first`."""
+    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
+    s0, s1, s2, s3, s4 = colour_bounds(cell_of_colour, colour)
+    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
+        for s in range(start, stop):
+            solve_cell(s, cells, nodes, dt_squared, is_first, multiplier, arity)
+
+
+@func
+def damp_cell(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, arity: ti.template()):
+    """Implicit Euler of the forces -tau k de/dt, strain by strain."""
+    d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
+    d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
+    w = weights(cells, nodes, s, arity)
+    law = cells.law[s]
+    rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
+    rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
+    p_u, p_v = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    if ti.static(arity == TRIANGLE):
+        strength = law[0] * law[3] * dt
+        n_u, n_v = d_u / ti.max(d_u.norm(), TINY_LENGTH), d_v / ti.max(d_v.norm(), TINY_LENGTH)
+        p_u = -strength * (n_u.dot(rate_u) + law[2] * n_v.dot(rate_v)) / (strength * w[0] + 1.0) * n_u
+        rate_u += w[0] * p_u
+        rate_v += w[2] * p_u
+        p_v = -strength * (n_v.dot(rate_v) + law[2] * n_u.dot(rate_u)) / (strength * w[1] + 1.0) * n_v
+        rate_u += w[2] * p_v
+        rate_v += w[1] * p_v
+    _, by = shear_of(d_u, d_v)
+    by_u, by_v = ti.math.vec3(by[0], by[1], by[2]), ti.math.vec3(by[3], by[4], by[5])
+    strength = law[1] * law[3] * dt
+    weight = w[0] * by_u.dot(by_u) + w[1] * by_v.dot(by_v) + 2.0 * w[2] * by_u.dot(by_v)
+    change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v)) / (strength * weight + 1.0)
+    p_u += change * by_u
+    p_v += change * by_v
+    for a in ti.static(range(arity)):
+        i = cells.nodes[arity * s + a]
+        push = cells.along[arity * s + a] * p_u + cells.across[arity * s + a] * p_v
+        motion.velocity[i] = motion.velocity[i] + nodes.inverse_mass[i] * push
+
+
+@kernel
+def damp_cells(
+    cells: CellArrays,
+    cell_of_colour: Integers,
+    colour: ti.i32,
+    nodes: Nodes,
+    motion: NodeMotion,
+    dt: ti.f32,
+    arity: ti.template(),
+):
+    """The cells of some colours, one colour after the other."""
+    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
+    s0, s1, s2, s3, s4 = colour_bounds(cell_of_colour, colour)
+    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
+        for s in range(start, stop):
+            damp_cell(s, cells, nodes, motion, dt, arity)
+
+
+@kernel
+def compute_cell_forces(
+    cells: CellArrays,
+    nodes: Nodes,
+    motion: NodeMotion,
+    first: ti.i32,
+    count: ti.i32,
+    arity: ti.template(),
+    force: Vectors,
+):
+    """-dW/dd_u and -dW/dd_v of each cell with damping [N m], one after the other from `first` on."""
+    for s in range(count):
+        d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
+        d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
+        rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
+        rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
+        law = cells.law[s]
+        shear, by = shear_of(d_u, d_v)
+        by_u, by_v = ti.math.vec3(by[0], by[1], by[2]), ti.math.vec3(by[3], by[4], by[5])
+        moment = -law[1] * (shear + law[3] * (by_u.dot(rate_u) + by_v.dot(rate_v)))
+        f_u, f_v = moment * by_u, moment * by_v
+        if ti.static(arity == TRIANGLE):
+            length, length_across = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
+            n_u, n_v = d_u / length, d_v / length_across
+            e_u = length - 1.0 + law[3] * n_u.dot(rate_u)
+            e_v = length_across - 1.0 + law[3] * n_v.dot(rate_v)
+            f_u -= law[0] * (e_u + law[2] * e_v) * n_u
+            f_v -= law[0] * (e_v + law[2] * e_u) * n_v
+        force[first + 2 * s] = f_u
+        force[first + 2 * s + 1] = f_v
+
+
+@kernel
+def measure_cell_excess(
+    cells: CellArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, share: Share
+) -> Results:
+    """Largest excess of triangles along warp and weft, as `spring_convergence` has it, and how many of both are beyond
+    `LARGEST_RESIDUAL`.
+    """
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        largest, unconverged = 0.0, 0.0
+        for k in range(share.items):
+            s = lane * share.lane_step + k * share.item_step
+            if s < count:
+                e_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
+                e_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
+                law = cells.law[s]
+                w = weights(cells, nodes, s, TRIANGLE)
+                if w[0] > 0.0:
+                    excess = e_u + law[2] * e_v + multiplier[STRAINS * s] / (law[0] * dt_squared)
+                    across = e_v + law[2] * e_u + multiplier[STRAINS * s + 1] / (law[0] * dt_squared)
+                    largest = ti.max(largest, excess, across)
+                    if excess > LARGEST_RESIDUAL:
+                        unconverged += 1.0
+                    if across > LARGEST_RESIDUAL:
+                        unconverged += 1.0
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
+    return reduced_tree(share.tree)
+
+
+@kernel
+def sum_over_cells(
+    cells: CellArrays, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
+) -> Results:
+    """Largest strain of triangles along warp and weft; elastic energy."""
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        largest = 0.0
+        energy = 0.0
+        for k in range(share.items):
+            s = lane * share.lane_step + k * share.item_step
+            if s < count:
+                d_u = derivative(cells.along, cells, nodes, carry, s, arity)
+                d_v = derivative(cells.across, cells, nodes, carry, s, arity)
+                law = cells.law[s]
+                shear, _ = shear_of(d_u, d_v)
+                energy += 0.5 * law[1] * shear * shear
+                if ti.static(arity == TRIANGLE):
+                    e_u, e_v = d_u.norm() - 1.0, d_v.norm() - 1.0
+                    energy += 0.5 * law[0] * (e_u * e_u + e_v * e_v + 2.0 * law[2] * e_u * e_v)
+                    largest = ti.max(largest, e_u, e_v)
+        share.tree.partial[lane] = largest
+        share.tree.partial[share.tree.lanes + lane] = energy
+    return reduced_tree(share.tree)
