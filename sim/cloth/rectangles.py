@@ -87,32 +87,32 @@ class RectangleSprings:
                 short,
             )
         for sweep in range(sweeps):
-            self._sweep(dt, is_first=sweep == 0)
+            for parity in range(2):
+                solve_cells_in_rows(
+                    blocks,
+                    parity,
+                    self._rectangle,
+                    ti.math.vec2(self._grid.step_x, self._grid.step_y),
+                    self._cell_stiffness,
+                    state.quantum,
+                    dt * dt,
+                    int(sweep == 0),
+                    self._cell_multipliers,
+                    short,
+                )
+            self._solve_threads(dt, is_first=sweep == 0)
         for axis in (ALONG_X, ALONG_Y):
             straighten_lines(blocks, self._lines[axis], short)
         store_blocks(blocks, state.nodes, self._rectangle, short)
 
     def sweep(self, dt: float) -> None:
-        """Solve the cells and threads once more, after contacts."""
+        """Solve the threads once more, after contacts."""
         load_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
-        self._sweep(dt, is_first=False)
+        self._solve_threads(dt, is_first=False)
         store_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
 
-    def _sweep(self, dt: float, *, is_first: bool) -> None:
-        state, grid, blocks, short = self._state, self._grid, self._blocks, self._is_short
-        for parity in range(2):
-            solve_cells_in_rows(
-                blocks,
-                parity,
-                self._rectangle,
-                ti.math.vec2(grid.step_x, grid.step_y),
-                self._cell_stiffness,
-                state.quantum,
-                dt * dt,
-                int(is_first),
-                self._cell_multipliers,
-                short,
-            )
+    def _solve_threads(self, dt: float, *, is_first: bool) -> None:
+        state, blocks, short = self._state, self._blocks, self._is_short
         for axis in (ALONG_X, ALONG_Y) if self._poisson > 0.0 else ():
             measure_lines(blocks, self._lines[axis], self._steps[axis], state.quantum, self._strains[axis], short)
         for axis in (ALONG_X, ALONG_Y):

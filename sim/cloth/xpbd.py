@@ -116,7 +116,7 @@ class XPBDSprings:
         for springs in self._bends:
             self._solve_bends(springs, dt)
         for sweep in range(sweeps):
-            self._sweep_lists(dt, is_first=sweep == 0)
+            self._sweep_lists(self._solved_cells, dt, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
         for rectangle in self._rectangles.values():
@@ -124,13 +124,13 @@ class XPBDSprings:
         self._momentum.restore(dt)
 
     def sweep(self, dt: float) -> None:
-        """Solve the cells and threads of the step once more, after contacts have pushed."""
-        self._sweep_lists(dt, is_first=False)
+        """Solve what bears tension once more, after contacts have pushed: threads, and the triangles of meshes."""
+        self._sweep_lists([cells for cells in self._solved_cells if cells.arity == TRIANGLE], dt, is_first=False)
         for rectangle in self._rectangles.values():
             rectangle.sweep(dt)
 
-    def _sweep_lists(self, dt: float, *, is_first: bool) -> None:
-        for cells in self._solved_cells:
+    def _sweep_lists(self, solved: Sequence[DeviceCells], dt: float, *, is_first: bool) -> None:
+        for cells in solved:
             for colour in cells.first_colours:
                 solve_cells(
                     cells.on_device,
