@@ -107,7 +107,7 @@ class ContinuousContacts:
         self._pairs = SelfCollision(state)
         self._patches = self._pairs.patches
         self._lone = LoneCloth(state, self._patches)
-        self.rigid.set_spacing(self._pairs.coarsest_edge)
+        self.rigid.set_spacing(self._pairs.coarsest_edge, self._pairs.longest_edge)
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
         self._pushed = PushedNodes(
@@ -155,7 +155,7 @@ class ContinuousContacts:
         # Pairs that have not followed the cloth for a while find, as they look, how far it is from where they left it.
         self._near = self._pairs if self._meets_cloth else self._lone
         self._near.begin_frame(state)
-        self.rigid.set_thickness(self._near.thickness)
+        self.rigid.set_thickness(float(copied(state.thickness).min()), self._near.thickness)
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())

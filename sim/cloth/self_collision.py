@@ -46,7 +46,7 @@ class SelfCollision:
         with_triangles, of_edges: the listed pairs.
         thickness: the largest [m].
         mean_edge: at rest, of all cloths together [m]; how far lists reach.
-        coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart.
+        coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart. `longest_edge` of all.
         searches: how many pairs of patches were searched since `begin_frame`, over the number of patches.
 
     Args:
@@ -64,7 +64,7 @@ class SelfCollision:
         self.of_edges = PairList(capacity=state.edge_count, pieces=self._met.capacity)
         edges = state.host.position[state.host.edges]
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
-        self.mean_edge = float(lengths.mean())
+        self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
         cloth_of = state.host.body[state.host.edges[:, 0]]
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
         self.thickness = 0.0

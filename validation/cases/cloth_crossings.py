@@ -188,7 +188,7 @@ def tablecloth(nodes: int) -> Scene:
 SCENES: dict[str, tuple[Callable[[int], Scene], int]] = {
     "ball": (over_a_ball, 80),
     "funnel": (in_a_funnel, 90),
-    "twisted column": (twisted, 120),
+    "twisted column": (twisted, 75),
     "two layers": (layers(2), 60),
     "five layers": (layers(5), 60),
     "pinched": (pinched, 75),
