@@ -157,10 +157,12 @@ class PatchNodes(NamedTuple):
 
 @bundle
 class PatchElements(NamedTuple):
-    """Triangles in lists, one of each patch."""
+    """Edges and triangles in lists, one of each patch."""
 
     count: ti.i32  # of the patches
-    first: Integers  # (m + 1,)
+    first_edge: Integers  # (m + 1,)
+    edges: Pairs
+    first_triangle: Integers  # (m + 1,)
     triangles: Triples
 
 

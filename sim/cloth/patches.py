@@ -69,7 +69,7 @@ class Patches:
         self.cloth = _array(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
         self.corner_lists = PatchNodes(self.count, self.first_corner, self.corners)
         self.vertex_lists = PatchNodes(self.count, self.first_vertex, self.vertices)
-        self.elements = PatchElements(self.count, self.first_triangle, self.triangles)
+        self.elements = PatchElements(self.count, self.first_edge, self.edges, self.first_triangle, self.triangles)
 
 
 def _patch_of_triangles(host: HostCloths) -> NDArray[np.int64]:

@@ -58,6 +58,10 @@ SEARCH_LEVELS = 5
 AT_CORNER = 0.98
 """What has this barycentric coordinate is a vertex."""
 
+WITH_EDGES = 2
+"""In `CollisionBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one
+point does not hold it: it turns about that."""
+
 Corners = ti.types.matrix(3, 3, ti.f32)
 """Those of a triangle, in rows."""
 
@@ -330,11 +334,16 @@ def touch_body(
     own_friction: ti.f32,
     corners: Four,
     weight: ti.math.vec4,
+    across: ti.math.mat3,
     recovery: ti.f32,
     bodies: CollidingBodies,
     contacts: Contacts,
 ):
-    """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps."""
+    """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps.
+
+    Of its gradient there only what is `across` the element counts in which this point is the nearest to the body: on
+    an edge of the body gradients are those of its faces, which would push the element along itself.
+    """
     r = x - bodies.position[b]
     relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
     reach = bodies.radius[b] + keeps + relative.norm()
@@ -349,6 +358,7 @@ def touch_body(
                 ahead[axis] = bodies.step[b]
                 gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
             n = turned @ unit_or(gradient, y)
+            n = unit_or(across @ n, n)
             least = least_displacement(distance, keeps, recovery)
             if distance < keeps or n.dot(relative) < least:
                 slot = ti.atomic_add(contacts.counter[0], 1)
@@ -445,6 +455,7 @@ def find_body_contacts_of_vertices(
                         surface.friction[i],
                         Four(i),
                         ti.math.vec4(1.0, 0.0, 0.0, 0.0),
+                        ti.Matrix.identity(ti.f32, 3),
                         recovery,
                         bodies,
                         contacts,
@@ -477,11 +488,20 @@ def find_body_contacts_of_triangles(
         while item < elements.count * lanes:
             m = item // lanes
             may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-            place = ti.select(may_touch == 1, elements.first[m], elements.first[m + 1]) + item % lanes
-            while place < elements.first[m + 1]:
+            place = ti.select(may_touch == 1, elements.first_edge[m], elements.first_edge[m + 1]) + item % lanes
+            while place < elements.first_edge[m + 1]:
+                ends = elements.edges[place]
                 for b in range(bodies.count):
-                    if bodies.shows[b] == 1:
-                        touch_triangle(b, elements.triangles[place], surface, inverse_mass, recovery, bodies, contacts)
+                    if bodies.shows[b] == WITH_EDGES:
+                        edge = Three(ends[0], ends[1], ends[1])
+                        touch_triangle(b, edge, True, surface, inverse_mass, recovery, bodies, contacts)
+                place += lanes
+            place = ti.select(may_touch == 1, elements.first_triangle[m], elements.first_triangle[m + 1]) + item % lanes
+            while place < elements.first_triangle[m + 1]:
+                for b in range(bodies.count):
+                    if bodies.shows[b] > 0:
+                        corners = elements.triangles[place]
+                        touch_triangle(b, corners, False, surface, inverse_mass, recovery, bodies, contacts)
                 place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
 
@@ -490,15 +510,17 @@ def find_body_contacts_of_triangles(
 def touch_triangle(
     b: ti.i32,
     corners: Three,
+    is_edge: ti.template(),
     surface: Surface,
     inverse_mass: Floats,
     recovery: ti.f32,
     bodies: CollidingBodies,
     contacts: Contacts,
 ):
-    """Append a body if it comes too near to a triangle between its corners.
+    """Append a body if it comes too near to a triangle between its corners, or to an edge: a, b, b.
 
-    A triangle with a corner that a pin holds in the body is where the job wants it.
+    What is nearest at an edge is left to that where edges are looked at, too. A triangle with a corner that a pin holds
+    in the body is where the job wants it.
     """
     v = corners
     half = 0.5 * surface.thickness[v[0]]
@@ -520,6 +542,16 @@ def touch_triangle(
                 if inverse_mass[v[k]] == 0.0:
                     is_held = is_held or distance_to(y[k, :], b, bodies.shapes) < 0.0
             share = deepest_on_triangle(y, b, bodies.shapes)
+            across = ti.Matrix.identity(ti.f32, 3)
+            if ti.static(is_edge):
+                along = unit_or(x[1, :] - x[0, :], x[2, :])
+                across -= along.outer_product(along)
+                share = ti.math.vec3(share[0], share[1] + share[2], 0.0)
+            elif bodies.shows[b] == WITH_EDGES and share.min() < 1.0 - AT_CORNER:
+                share[0] = 1.0
+            elif bodies.shows[b] == WITH_EDGES:
+                n = unit_or((x[1, :] - x[0, :]).cross(x[2, :] - x[0, :]), x[2, :])
+                across = n.outer_product(n)
             if not is_held and share.max() < AT_CORNER:
                 touch_body(
                     b,
@@ -529,6 +561,7 @@ def touch_triangle(
                     surface.friction[v[0]],
                     Four(v[0], v[1], v[2], v[0]),
                     ti.math.vec4(share[0], share[1], share[2], 0.0),
+                    across,
                     recovery,
                     bodies,
                     contacts,

@@ -26,7 +26,7 @@ class CollisionBodies(DeviceShapes):
     """All bodies that cloth may touch: those that move, then those that stand still.
 
     Attributes:
-        shows: whether it may show between vertices, so that triangles are looked at, (b,).
+        shows: whether it may show between vertices, so that triangles are looked at; 2 if edges are, too, (b,).
         friction: [-], (b,).
         position: centre of mass at the start of the substep [m], (b,) vec3.
         rotation: body axes to world axes, (b,) mat3.
@@ -131,7 +131,7 @@ class CollisionBodies(DeviceShapes):
 
     def look_at_triangles(self, shows: NDArray[np.bool_]) -> None:
         """Say which bodies may show between vertices, (b,)."""
-        put(self.shows, shows)
+        put(self.shows, np.where(self.on_device.kind.to_numpy()[: self.count] == SPHERE, 1, 2) * shows)
 
     def set_motion(self, shift: Array, turn: Array) -> None:
         """Say how the bodies would move in a substep without cloth.

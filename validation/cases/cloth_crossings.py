@@ -1,6 +1,6 @@
 """Cloth that falls, crumples, is twisted, pressed, pinched, shot at and pulled away: what passes through what.
 
-    python -m validation.cases.cloth_crossings [SCENE ...] [--nodes 40] [--share 1.0]
+    python -m validation.cases.cloth_crossings [SCENE ...] [--nodes 32] [--share 1.0]
 
 prints a table, then JSON; the scenes are built and stepped as a job's are, with the defaults of one.
 """
@@ -130,7 +130,8 @@ def layers(count: int) -> Callable[[int], Scene]:
     """So many sheets on the floor, and two bodies of 50 kg on them, a box and a ball."""
 
     def scene(nodes: int) -> Scene:
-        sheets = [sheet(1.0, nodes, 1e-3 * (k + 1), rotation_deg=(0.0, 0.0, 7.0 * k)) for k in range(count)]
+        side = round(nodes * (2.0 / count) ** 0.5)
+        sheets = [sheet(1.0, side, 1e-3 * (k + 1), rotation_deg=(0.0, 0.0, 7.0 * k)) for k in range(count)]
         top, steel = 1e-3 * (count + 1), {"kind": "dynamic", "density": STEEL}
         cube = box((0.2, 0.2, 0.16), (-0.25, 0.0, top + 0.1), **steel)
         heavy = [cube, ball(0.115, (0.25, 0.0, top + 0.135), **steel)]
@@ -343,7 +344,7 @@ def draw(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
-CASE = Case(find, draw, solvers=("cloth",), sizes={"nodes": (40, 17), "share": (1.0, 0.4)})
+CASE = Case(find, draw, solvers=("cloth",), sizes={"nodes": (32, 17), "share": (1.0, 0.4)})
 
 
 def main() -> None:
@@ -352,7 +353,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", default=[], help=f"of {', '.join(SCENES)}")
-    parser.add_argument("--nodes", type=int, default=40, help="along a side (default: %(default)s)")
+    parser.add_argument("--nodes", type=int, default=32, help="along a side (default: %(default)s)")
     parser.add_argument("--share", type=float, default=1.0, help="of the frames (default: %(default)s)")
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
