@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
-from sim.cloth.self_collision import SelfCollision, box_of
+from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short
@@ -42,7 +43,8 @@ RECOVERY_TIME_S = 0.01
 """Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""
 
 LARGEST_MOTION = 0.5
-"""How far vertices may get from their common motion in a step, in mean edges: farther, the lists grow too long."""
+"""How far vertices may get from their common motion in a step, in mean edges: farther, the lists grow too long. Cloths
+that are farther apart may come half of the way."""
 
 JAMMED_SHARE = 0.1
 """A cloth is jammed in a frame where impact zones move so much of its nodes as one, on average over the substeps. Falls
@@ -140,13 +142,40 @@ class ContinuousContacts:
 
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
-        velocity = box_of(state.velocity, state.vertex_count, self._ends)
-        deviation = float(np.linalg.norm(velocity[1]))
-        if deviation > 0.0 and self._meets_cloth:
-            at_most = min(at_most, LARGEST_MOTION * self._pairs.mean_edge / deviation)
-        return self.rigid.stable_dt(
-            *velocity, lambda: box_of(state.position, state.vertex_count, self._ends), at_most=at_most
+        n, first = state.vertex_count, state.host.first_node
+        velocity = self._box(state.velocity, 0, n)
+        shortest = self.rigid.stable_dt(
+            *velocity,
+            lambda: self._box(state.position, 0, n),
+            at_most=self._little_motion(velocity, at_most) if self._meets_cloth else at_most,
         )
+        if shortest == at_most or len(state.names) == 1:
+            return shortest
+        velocities, places = (
+            [self._box(vectors, *ends) for ends in pairwise(first)] for vectors in (state.velocity, state.position)
+        )
+        shortest = at_most
+        for number, (velocity, place) in enumerate(zip(velocities, places, strict=True)):
+            if state.self_collision[number]:
+                shortest = self._little_motion(velocity, shortest)
+            shortest = self.rigid.stable_dt(*velocity, lambda place=place: place, at_most=shortest)
+        for a, b in combinations(range(len(state.names)), 2):
+            apart, closing = (
+                np.abs(each[a][0] - each[b][0]) + sign * (each[a][1] + each[b][1])
+                for each, sign in ((places, -1.0), (velocities, 1.0))
+            )
+            room = float(np.linalg.norm(np.maximum(apart, 0.0))) - self._pairs.thickness
+            from_far = 0.5 * room / max(float(np.linalg.norm(closing)), 1.0e-30)
+            together = self._little_motion((velocities[a][0], 0.5 * closing), shortest)
+            shortest = min(shortest, max(together, from_far))
+        return shortest
+
+    def _box(self, vectors: ti.Ndarray, first: int, end: int) -> Box:
+        return box_of(vectors, int(first), int(end), self._ends)
+
+    def _little_motion(self, velocity: Box, at_most: float) -> float:
+        """Largest step [s] in which cloth with such a box of velocities [m/s] moves little against itself."""
+        return min(at_most, LARGEST_MOTION * self._pairs.mean_edge / max(float(np.linalg.norm(velocity[1])), 1.0e-30))
 
     def begin_frame(self) -> None:
         """Count anew, and expect of contacts what a run does that continues here."""

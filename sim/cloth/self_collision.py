@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sim.cloth.state import ClothState
 
 Array = NDArray[np.float64]
+Box = tuple[Array, Array]
 
 REACH_IN_EDGES = 0.85
 LEAST_SKIN_IN_EDGES = 0.15
@@ -216,14 +217,15 @@ class SelfCollision:
         )
 
 
-def box_of(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple[Array, Array]:
+def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Box:
     """Middle and half edges of the box around vectors, (3,) each, the same whatever their order.
 
     Args:
-        vectors: of which the first `count` are looked at.
-        count: at least 1.
+        vectors: of which those from `first` up to `end` are looked at, at least one.
+        first, end: numbers.
         ends_of: of six maxima.
     """
-    numbers = range_of_vectors(vectors, count, ends_of.over(count), is_short(count, NODE_NS))
+    count = end - first
+    numbers = range_of_vectors(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
     ends = ends_of.unpack(numbers).astype(np.float64)
     return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])

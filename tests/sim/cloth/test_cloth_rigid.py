@@ -269,6 +269,17 @@ def test_a_bullet_past_a_curtain_makes_no_more_substeps_for_it():
     assert substeps <= expected + 12
 
 
+def test_a_cloth_that_flies_past_makes_no_more_substeps_for_all():
+    """At 60 m/s; one that flaps by so much is given half an edge a step, a hundred steps a frame."""
+    sheet = {"shape": rectangle((0.3, 0.3), (13, 13)), "pin": [{"edge": "y+"}]}
+    ball = {"shape": BALL, "position": (0.0, 0.0, -0.06)}
+    flying = {"shape": rectangle((0.2, 0.2), (9, 9)), "position": (-1.0, 0.0, 0.5), "velocity": (60.0, 0.0, 0.0)}
+    alone, beside = world_of(sheet, bodies=[ball], domain=SPACE), world_of(sheet, flying, bodies=[ball], domain=SPACE)
+    expected, substeps = alone.advance_frame().substeps["cloth"], beside.advance_frame().substeps["cloth"]
+    assert cloth_of(beside).state.positions()[169:, 0].mean() == pytest.approx(0.0, abs=1e-3)
+    assert substeps <= expected + 12
+
+
 def test_a_pinned_sheet_catches_a_heavy_ball():
     corners = [{"corner": corner} for corner in ("x-y-", "x+y-", "x-y+", "x+y+")]
     sheet = {
