@@ -399,6 +399,7 @@ class CollidingBodies(NamedTuple):
     count: ti.i32  # b
     shapes: Shapes
     shows: Integers
+    depth: Floats  # in thicknesses
     centre_of_mass: Vectors  # [m]
     radius: Floats  # [m]
     step: Floats  # [m]

@@ -185,6 +185,7 @@ class ContinuousContacts:
         self._near = self._pairs if self._meets_cloth else self._lone
         self._near.begin_frame(state)
         self.rigid.set_thickness(float(copied(state.thickness).min()), self._near.thickness)
+        self.rigid.bodies.begin_frame()
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())
@@ -195,7 +196,8 @@ class ContinuousContacts:
         `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
         that had to move with others, `crossings_left` pairs that even so may have crossed, as where pins are led
         through each other; all summed over the substeps. `jammed` is 1 in a frame with a cloth of which impact zones
-        moved more than `JAMMED_SHARE`, on average over the substeps.
+        moved more than `JAMMED_SHARE`, on average over the substeps; `bodies_show` in one where cloth was deeper in a
+        body than it is thick.
         """
         body = self._state.host.body
         nodes = np.bincount(body, minlength=len(self._moved_as_one))
@@ -207,6 +209,7 @@ class ContinuousContacts:
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
             "jammed": float(is_jammed.any()),
+            "bodies_show": float(copied(self.rigid.bodies.depth).max() > 1.0),
         }
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -233,6 +233,7 @@ class RigidContact:
             motion,
             self._largest_half,
             state.surface,
+            state.inverse_mass,
             bodies,
             recovery,
             contacts.found,
@@ -335,6 +336,7 @@ def touch_body(
     corners: Four,
     weight: ti.math.vec4,
     across: ti.math.mat3,
+    half: ti.f32,
     recovery: ti.f32,
     bodies: CollidingBodies,
     contacts: Contacts,
@@ -342,7 +344,8 @@ def touch_body(
     """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps.
 
     Of its gradient there only what is `across` the element counts in which this point is the nearest to the body: on
-    an edge of the body gradients are those of its faces, which would push the element along itself.
+    an edge of the body gradients are those of its faces, which would push the element along itself. How deep it is gets
+    noted in thicknesses, if `half` of that is not 0.
     """
     r = x - bodies.position[b]
     relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
@@ -351,6 +354,8 @@ def touch_body(
         turned = bodies.rotation[b]
         y = turned.transpose() @ r + bodies.centre_of_mass[b]
         distance = distance_to(y, b, bodies.shapes)
+        if distance < 0.0 and half > 0.0:
+            ti.atomic_max(bodies.depth[b], -0.5 * distance / half)
         if distance < keeps + relative.norm():
             gradient = ti.math.vec3(0.0)
             for axis in ti.static(range(3)):
@@ -370,17 +375,16 @@ def touch_body(
 
 
 @func
-def deepest_on_triangle(y: Corners, b: ti.i32, shapes: Shapes) -> ti.math.vec3:
+def deepest_on_triangle(y: Corners, in_middle: ti.f32, b: ti.i32, shapes: Shapes) -> ti.math.vec3:
     """Barycentric coordinates of the point of a triangle, in the frame of a shape, that is deepest in it or nearest.
 
-    Of balls exact. Else the best of six points around the best so far, ever nearer: distances to convex bodies have
-    no minimum but one.
+    Of balls exact. Else the best of six points around the best so far, ever nearer, from the middle on: distances to
+    convex bodies have no minimum but one.
     """
-    best, step = ti.math.vec3(1.0 / 3.0), 1.0 / 3.0
+    best, least, step = ti.math.vec3(1.0 / 3.0), in_middle, 1.0 / 3.0
     if shapes.kind[b] == SPHERE:
         best = closest_on_triangle(ti.math.vec3(0.0), y[0, :], y[1, :], y[2, :])
     else:
-        least = distance_to(y.transpose() @ best, b, shapes)
         for level in range(SEARCH_LEVELS):
             around = best
             for k in range(6):
@@ -397,29 +401,6 @@ def deepest_on_triangle(y: Corners, b: ti.i32, shapes: Shapes) -> ti.math.vec3:
     return best
 
 
-@func
-def may_show(y: Corners, within: ti.f32, slack: ti.f32, b: ti.i32, shapes: Shapes) -> ti.i32:
-    """Whether a body may be within a distance [m] of a triangle, and nearer than to its corners by more than a slack.
-
-    The distance to a convex body is a convex function: it sags nowhere below that between the corners by more than
-    three times what it does in their middle.
-    """
-    third = ti.math.vec3(1.0 / 3.0)
-    middle = y.transpose() @ third
-    size = 0.0
-    for k in ti.static(range(3)):
-        size = ti.max(size, (y[k, :] - middle).norm())
-    distance = distance_to(middle, b, shapes)
-    # Outside of its grid a distance is at most three times too large: the body is in the grid, and it is 1-Lipschitz.
-    may = ti.select(shapes.kind[b] == GRID, distance / 3.0, distance) < within + size
-    if may and shapes.kind[b] != GRID and shapes.kind[b] != TORUS:
-        sag = -distance
-        for k in ti.static(range(3)):
-            sag += third[k] * distance_to(y[k, :], b, shapes)
-        may = 3.0 * sag > slack
-    return ti.cast(may, ti.i32)
-
-
 @kernel
 def find_body_contacts_of_vertices(
     listed: PatchNodes,
@@ -429,6 +410,7 @@ def find_body_contacts_of_vertices(
     motion: PatchMotion,
     largest_half: ti.f32,
     surface: Surface,
+    inverse_mass: Floats,
     bodies: CollidingBodies,
     recovery: ti.f32,
     contacts: Contacts,
@@ -456,6 +438,7 @@ def find_body_contacts_of_vertices(
                         Four(i),
                         ti.math.vec4(1.0, 0.0, 0.0, 0.0),
                         ti.Matrix.identity(ti.f32, 3),
+                        ti.select(inverse_mass[i] > 0.0, 0.5 * surface.thickness[i], 0.0),
                         recovery,
                         bodies,
                         contacts,
@@ -488,20 +471,20 @@ def find_body_contacts_of_triangles(
         while item < elements.count * lanes:
             m = item // lanes
             may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-            place = ti.select(may_touch == 1, elements.first_edge[m], elements.first_edge[m + 1]) + item % lanes
-            while place < elements.first_edge[m + 1]:
-                ends = elements.edges[place]
+            # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
+            edges = elements.first_edge[m + 1] - elements.first_edge[m]
+            end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
+            place = ti.select(may_touch == 1, item % lanes, end)
+            while place < end:
+                corners = Three(0)
+                if place < edges:
+                    ends = elements.edges[elements.first_edge[m] + place]
+                    corners = Three(ends[0], ends[1], ends[1])
+                else:
+                    corners = elements.triangles[elements.first_triangle[m] + place - edges]
                 for b in range(bodies.count):
-                    if bodies.shows[b] == WITH_EDGES:
-                        edge = Three(ends[0], ends[1], ends[1])
-                        touch_triangle(b, edge, True, surface, inverse_mass, recovery, bodies, contacts)
-                place += lanes
-            place = ti.select(may_touch == 1, elements.first_triangle[m], elements.first_triangle[m + 1]) + item % lanes
-            while place < elements.first_triangle[m + 1]:
-                for b in range(bodies.count):
-                    if bodies.shows[b] > 0:
-                        corners = elements.triangles[place]
-                        touch_triangle(b, corners, False, surface, inverse_mass, recovery, bodies, contacts)
+                    if bodies.shows[b] > ti.cast(place < edges, ti.i32):
+                        touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)
                 place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
 
@@ -510,7 +493,6 @@ def find_body_contacts_of_triangles(
 def touch_triangle(
     b: ti.i32,
     corners: Three,
-    is_edge: ti.template(),
     surface: Surface,
     inverse_mass: Floats,
     recovery: ti.f32,
@@ -520,12 +502,13 @@ def touch_triangle(
     """Append a body if it comes too near to a triangle between its corners, or to an edge: a, b, b.
 
     What is nearest at an edge is left to that where edges are looked at, too. A triangle with a corner that a pin holds
-    in the body is where the job wants it.
+    in the body is where the job wants it. The distance to a convex body is a convex function: it sags nowhere below
+    that between the corners by more than three times what it does in their middle.
     """
-    v = corners
+    v, third = corners, 1.0 / 3.0
     half = 0.5 * surface.thickness[v[0]]
     y, u, x = Corners(0.0), Corners(0.0), Corners(0.0)
-    farthest, nearest, is_held = 0.0, 1.0e30, False
+    farthest, nearest = 0.0, 1.0e30
     for k in ti.static(range(3)):
         r = surface.position[v[k]] - bodies.position[b]
         relative = surface.displacement[v[k]] - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
@@ -536,33 +519,43 @@ def touch_triangle(
             y[k, axis] = at[axis]
     size = ti.max((y[1, :] - y[0, :]).norm(), (y[2, :] - y[0, :]).norm())
     if nearest < bodies.radius[b] + half + size + farthest:
-        within, slack = half + farthest, (1.0 - OF_TRIANGLES) * half
-        if may_show(y, within, slack, b, bodies.shapes) == 1:
-            for k in ti.static(range(3)):
-                if inverse_mass[v[k]] == 0.0:
-                    is_held = is_held or distance_to(y[k, :], b, bodies.shapes) < 0.0
-            share = deepest_on_triangle(y, b, bodies.shapes)
-            across = ti.Matrix.identity(ti.f32, 3)
-            if ti.static(is_edge):
-                along = unit_or(x[1, :] - x[0, :], x[2, :])
-                across -= along.outer_product(along)
-                share = ti.math.vec3(share[0], share[1] + share[2], 0.0)
-            elif bodies.shows[b] == WITH_EDGES and share.min() < 1.0 - AT_CORNER:
-                share[0] = 1.0
-            elif bodies.shows[b] == WITH_EDGES:
-                n = unit_or((x[1, :] - x[0, :]).cross(x[2, :] - x[0, :]), x[2, :])
-                across = n.outer_product(n)
-            if not is_held and share.max() < AT_CORNER:
-                touch_body(
-                    b,
-                    x.transpose() @ share,
-                    u.transpose() @ share,
-                    OF_TRIANGLES * half,
-                    surface.friction[v[0]],
-                    Four(v[0], v[1], v[2], v[0]),
-                    ti.math.vec4(share[0], share[1], share[2], 0.0),
-                    across,
-                    recovery,
-                    bodies,
-                    contacts,
-                )
+        in_middle = distance_to(y.transpose() @ ti.math.vec3(third), b, bodies.shapes)
+        # Outside of its grid a distance is at most three times too large: the body is in the grid, it is 1-Lipschitz.
+        is_grid = bodies.shapes.kind[b] == GRID
+        if ti.select(is_grid, third * in_middle, in_middle) < half + size + farthest:
+            sag, is_held = -in_middle, False
+            for k in range(3):
+                share = ti.math.vec3(ti.cast(k == 0, ti.f32), ti.cast(k == 1, ti.f32), ti.cast(k == 2, ti.f32))
+                distance = distance_to(y.transpose() @ share, b, bodies.shapes)
+                sag += third * distance
+                held = ti.select(k == 0, v[0], ti.select(k == 1, v[1], v[2]))
+                if inverse_mass[held] == 0.0 and distance < 0.0:
+                    is_held = True
+            is_round = not is_grid and bodies.shapes.kind[b] != TORUS
+            if not is_held and not (is_round and 3.0 * sag < (1.0 - OF_TRIANGLES) * half):
+                share = deepest_on_triangle(y, in_middle, b, bodies.shapes)
+                across = ti.Matrix.identity(ti.f32, 3)
+                if v[1] == v[2]:
+                    along = unit_or(x[1, :] - x[0, :], x[2, :])
+                    across -= along.outer_product(along)
+                    share = ti.math.vec3(share[0], share[1] + share[2], 0.0)
+                elif bodies.shows[b] == WITH_EDGES:
+                    n = unit_or((x[1, :] - x[0, :]).cross(x[2, :] - x[0, :]), x[2, :])
+                    across = n.outer_product(n)
+                    if share.min() < 1.0 - AT_CORNER:
+                        share[0] = 1.0
+                if share.max() < AT_CORNER:
+                    touch_body(
+                        b,
+                        x.transpose() @ share,
+                        u.transpose() @ share,
+                        OF_TRIANGLES * half,
+                        surface.friction[v[0]],
+                        Four(v[0], v[1], v[2], v[0]),
+                        ti.math.vec4(share[0], share[1], share[2], 0.0),
+                        across,
+                        half,
+                        recovery,
+                        bodies,
+                        contacts,
+                    )

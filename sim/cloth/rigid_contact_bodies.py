@@ -27,6 +27,7 @@ class CollisionBodies(DeviceShapes):
 
     Attributes:
         shows: whether it may show between vertices, so that triangles are looked at; 2 if edges are, too, (b,).
+        depth: how deep free cloth was in each at most since `begin_frame`, in its thicknesses, (b,).
         friction: [-], (b,).
         position: centre of mass at the start of the substep [m], (b,) vec3.
         rotation: body axes to world axes, (b,) mat3.
@@ -49,7 +50,8 @@ class CollisionBodies(DeviceShapes):
         room = max(self.count, 1)
         self.shows = ti.ndarray(ti.i32, room)
         self.shows.fill(0)
-        self.friction, self.inverse_mass = (ti.ndarray(ti.f32, room) for _ in range(2))
+        self.friction, self.inverse_mass, self.depth = (ti.ndarray(ti.f32, room) for _ in range(3))
+        self.begin_frame()
         self.position = ti.Vector.ndarray(3, ti.f32, room)
         self.motion, self.motion_start, self.motion_reached = (ti.Vector.ndarray(3, ti.f32, 2 * room) for _ in range(3))
         self.rotation, self.inverse_inertia = (ti.Matrix.ndarray(3, 3, ti.f32, room) for _ in range(2))
@@ -69,6 +71,7 @@ class CollisionBodies(DeviceShapes):
             count=self.count,
             shapes=self.on_device,
             shows=self.shows,
+            depth=self.depth,
             centre_of_mass=self.centre_of_mass,
             radius=self.radius,
             step=self.step,
@@ -94,6 +97,10 @@ class CollisionBodies(DeviceShapes):
             load=self.load,
             load_unit=self.load_unit,
         )
+
+    def begin_frame(self) -> None:
+        """Note anew how deep cloth gets."""
+        self.depth.fill(0.0)
 
     def set_friction(self, friction: Array) -> None:
         """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""

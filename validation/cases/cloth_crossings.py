@@ -215,7 +215,7 @@ def measure(name: str, nodes: int, share: float = 1.0) -> dict[str, Any]:
         raise TypeError(f"the solver of cloth is a {type(cloth).__name__}")
     corners = cloth.state.host.triangles
     rows: dict[str, list[float]] = {
-        key: [] for key in ("crossings", "depth_mm", "passed", "strain", "substeps", "ms", "left", "zoned")
+        key: [] for key in ("crossings", "depth_mm", "passed", "strain", "substeps", "ms", "left", "zoned", "told")
     }
     watch = _Watch(world, cloth)
     world.watch = watch
@@ -232,6 +232,7 @@ def measure(name: str, nodes: int, share: float = 1.0) -> dict[str, Any]:
         rows["ms"].append(1e3 * spent)
         rows["left"].append(numbers["crossings_left"])
         rows["zoned"].append(numbers["impact_zone_vertices"])
+        rows["told"].append(numbers.get("bodies_show", 0.0))
     return {"scene": name, "nodes": len(watch.positions), "frames": len(rows["ms"]), **rows}
 
 
@@ -316,7 +317,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> str:
     """Found numbers as a Markdown table."""
     lines = [
         "| scene | nodes | frames | crossings | passed | shows [mm] | most strain [%] | most substeps | "
-        "median, worst ms | left, zoned |",
+        "median, worst ms | left, zoned, told |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -324,7 +325,8 @@ def table_of(rows: Sequence[dict[str, Any]]) -> str:
         lines.append(
             f"| {row['scene']} | {row['nodes']} | {row['frames']} | {sum(row['crossings'])} | {sum(row['passed'])} | "
             f"{max(row['depth_mm']):.2f} | {100 * max(row['strain']):.1f} | {max(row['substeps'])} | "
-            f"{np.median(settled):.0f}, {max(settled):.0f} | {sum(row['left']):.0f}, {sum(row['zoned']):.0f} |"
+            f"{np.median(settled):.0f}, {max(settled):.0f} | "
+            f"{sum(row['left']):.0f}, {sum(row['zoned']):.0f}, {sum(row['told']):.0f} |"
         )
     return "\n".join(lines)
 
