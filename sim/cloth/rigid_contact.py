@@ -531,8 +531,8 @@ def touch_triangle(
                 held = ti.select(k == 0, v[0], ti.select(k == 1, v[1], v[2]))
                 if inverse_mass[held] == 0.0 and distance < 0.0:
                     is_held = True
-            is_round = not is_grid and bodies.shapes.kind[b] != TORUS
-            if not is_held and not (is_round and 3.0 * sag < (1.0 - OF_TRIANGLES) * half):
+            is_convex = not is_grid and bodies.shapes.kind[b] != TORUS
+            if not is_held and not (is_convex and 3.0 * sag < (1.0 - OF_TRIANGLES) * half):
                 share = deepest_on_triangle(y, in_middle, b, bodies.shapes)
                 across = ti.Matrix.identity(ti.f32, 3)
                 if v[1] == v[2]:
