@@ -19,7 +19,7 @@ from sim.cloth.bundles import (
     Three,
     Walls,
 )
-from sim.cloth.loop_costs import NODE_AT_BODIES_NS, PATCH_AT_BODY_NS, PATCH_AT_WALLS_NS
+from sim.cloth.loop_costs import PATCH_AT_WALLS_NS
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, least_displacement
@@ -224,7 +224,6 @@ class RigidContact:
         if not self.bodies.count:
             return
         workers, bodies = workers_for(patches.count * lanes), self.bodies.colliding
-        few_bodies = is_short(patches.count * bodies.count, PATCH_AT_BODY_NS)
         find_body_contacts_of_vertices(
             patches.vertex_lists,
             lanes,
@@ -237,7 +236,6 @@ class RigidContact:
             bodies,
             recovery,
             contacts.found,
-            few_bodies and is_short(patches.vertex_count, NODE_AT_BODIES_NS),
         )
         if self._shows.any():
             find_body_contacts_of_triangles(
@@ -252,7 +250,6 @@ class RigidContact:
                 bodies,
                 recovery,
                 contacts.found,
-                few_bodies and is_short(patches.triangle_count, NODE_AT_BODIES_NS),
             )
 
 
@@ -335,6 +332,7 @@ def touch_body(
     own_friction: ti.f32,
     corners: Four,
     weight: ti.math.vec4,
+    is_vertex: ti.template(),
     across: ti.math.mat3,
     half: ti.f32,
     recovery: ti.f32,
@@ -363,7 +361,8 @@ def touch_body(
                 ahead[axis] = bodies.step[b]
                 gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
             n = turned @ unit_or(gradient, y)
-            n = unit_or(across @ n, n)
+            if ti.static(not is_vertex):
+                n = unit_or(across @ n, n)
             least = least_displacement(distance, keeps, recovery)
             if distance < keeps or n.dot(relative) < least:
                 slot = ti.atomic_add(contacts.counter[0], 1)
@@ -414,12 +413,12 @@ def find_body_contacts_of_vertices(
     bodies: CollidingBodies,
     recovery: ti.f32,
     contacts: Contacts,
-    is_short: ti.template(),
 ):
-    """Append the contacts of vertices with bodies."""
+    """Append the contacts of vertices with bodies.
+
+    Parallel however few there are: compiled twice, normals would be rounded differently.
+    """
     begin_sharing(taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < listed.count * lanes:
@@ -437,6 +436,7 @@ def find_body_contacts_of_vertices(
                         surface.friction[i],
                         Four(i),
                         ti.math.vec4(1.0, 0.0, 0.0, 0.0),
+                        True,
                         ti.Matrix.identity(ti.f32, 3),
                         ti.select(inverse_mass[i] > 0.0, 0.5 * surface.thickness[i], 0.0),
                         recovery,
@@ -460,12 +460,9 @@ def find_body_contacts_of_triangles(
     bodies: CollidingBodies,
     recovery: ti.f32,
     contacts: Contacts,
-    is_short: ti.template(),
 ):
     """Append the contacts of triangles, each at its deepest point, with bodies that may show between vertices."""
     begin_sharing(taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < elements.count * lanes:
@@ -553,6 +550,7 @@ def touch_triangle(
                         surface.friction[v[0]],
                         Four(v[0], v[1], v[2], v[0]),
                         ti.math.vec4(share[0], share[1], share[2], 0.0),
+                        False,
                         across,
                         half,
                         recovery,
