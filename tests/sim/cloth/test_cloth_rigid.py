@@ -101,6 +101,19 @@ def test_a_heavy_body_rests_on_cloth_and_not_on_what_is_below(shape, lowest, tab
     assert strains[-1] < strains[15] + 0.005
 
 
+def test_a_body_that_several_layers_do_not_carry_is_told_and_a_pin_in_a_post_is_not():
+    """50 kg on five layers of nodes of 0.2 g; and an edge that is pinned in the middle of a bar."""
+    layers = [{"shape": rectangle((0.2, 0.2), (6, 6)), "position": (0.0, 0.0, 0.5e-3 * (k + 1))} for k in range(5)]
+    heavy = {"kind": "dynamic", "density": 7800.0, "shape": {"type": "sphere", "radius": 0.115}}
+    laden = world_of(*layers, bodies=[{**heavy, "position": (0.0, 0.0, 0.13)}])
+    pinned = {"shape": rectangle((0.2, 0.2), (9, 9)), "position": (0.1, 0.0, 0.5), "pin": [{"edge": "x-"}]}
+    bar = {"shape": {"type": "cylinder", "radius": 0.02, "height": 0.3}, "rotation_deg": (90.0, 0.0, 0.0)}
+    hung = world_of(pinned, bodies=[{**bar, "position": (0.0, 0.0, 0.5)}])
+    told = [sum(world.advance_frame().diagnostics["cloth"]["bodies_show"] for _ in range(8)) for world in (laden, hung)]
+    assert told[0] > 0
+    assert told[1] == 0
+
+
 # --- momentum and energy --------------------------------------------------------------------------------------------
 
 
