@@ -91,6 +91,7 @@ _KNOWN = {
         Quantity("crossings_left", "crossings left", "", "Cloth crossings left", counted=True),
         Quantity("impact_zone_vertices", "nodes moved as one", "", "Cloth nodes moved as one", counted=True),
         Quantity("jammed", "cloth jammed", "", "Frames with jammed cloth", counted=True),
+        Quantity("bodies_show", "bodies show through", "", "Frames with bodies in cloth", counted=True),
         Quantity("overlong_springs", "springs too long", "", "Cloth springs too long", counted=True),
         Quantity("max_strain", "largest strain", SHARE, "Strain"),
         Quantity("wall_contacts", "wall contacts", "", "Contacts", counted=True),
@@ -164,6 +165,12 @@ WARNINGS = (
         "frames have",
         " cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and bodies, or a "
         "larger thickness",
+    ),
+    CountedEvent(
+        "bodies_show",
+        "frame has",
+        "frames have",
+        " cloth deeper in a body than it is thick: give more substeps, a lighter body, fewer layers or a finer sheet",
     ),
     CountedEvent(
         "overlong_springs",

@@ -12,11 +12,12 @@ from sim.core.bundles import bundle
 from sim.shapes.device_shapes import Shapes
 
 Two = ti.types.vector(2, ti.i32)
+Three = ti.types.vector(3, ti.i32)
 Four = ti.types.vector(4, ti.i32)
 Lattice = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
 Laws = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
 Pairs = ti.types.ndarray(dtype=Two, ndim=1)
-Triples = ti.types.ndarray(dtype=ti.types.vector(3, ti.i32), ndim=1)
+Triples = ti.types.ndarray(dtype=Three, ndim=1)
 Quadruples = ti.types.ndarray(dtype=Four, ndim=1)
 Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
@@ -418,7 +419,8 @@ class CollidingBodies(NamedTuple):
 
     count: ti.i32  # b
     shapes: Shapes
-    has_edges: Integers
+    shows: Integers
+    depth: Floats  # in thicknesses
     centre_of_mass: Vectors  # [m]
     radius: Floats  # [m]
     step: Floats  # [m]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
-from sim.cloth.self_collision import SelfCollision, box_of
+from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short
@@ -42,7 +43,8 @@ RECOVERY_TIME_S = 0.01
 """Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""
 
 LARGEST_MOTION = 0.5
-"""How far vertices may get from their common motion in a step, in mean edges: farther, the lists grow too long."""
+"""How far vertices may get from their common motion in a step, in mean edges: farther, the lists grow too long. Cloths
+that are farther apart may come half of the way."""
 
 JAMMED_SHARE = 0.1
 """A cloth is jammed in a frame where impact zones move so much of its nodes as one, on average over the substeps. Falls
@@ -107,7 +109,7 @@ class ContinuousContacts:
         self._pairs = SelfCollision(state)
         self._patches = self._pairs.patches
         self._lone = LoneCloth(state, self._patches)
-        self.rigid.set_spacing(self._pairs.coarsest_edge)
+        self.rigid.set_spacing(self._pairs.coarsest_edge, self._pairs.longest_edge)
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
         self._pushed = PushedNodes(
@@ -140,13 +142,40 @@ class ContinuousContacts:
 
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
-        velocity = box_of(state.velocity, state.vertex_count, self._ends)
-        deviation = float(np.linalg.norm(velocity[1]))
-        if deviation > 0.0 and self._meets_cloth:
-            at_most = min(at_most, LARGEST_MOTION * self._pairs.mean_edge / deviation)
-        return self.rigid.stable_dt(
-            *velocity, lambda: box_of(state.position, state.vertex_count, self._ends), at_most=at_most
+        n, first = state.vertex_count, state.host.first_node
+        velocity = self._box(state.velocity, 0, n)
+        shortest = self.rigid.stable_dt(
+            *velocity,
+            lambda: self._box(state.position, 0, n),
+            at_most=self._little_motion(velocity, at_most) if self._meets_cloth else at_most,
         )
+        if shortest == at_most or len(state.names) == 1:
+            return shortest
+        velocities, places = (
+            [self._box(vectors, *ends) for ends in pairwise(first)] for vectors in (state.velocity, state.position)
+        )
+        shortest = at_most
+        for number, (velocity, place) in enumerate(zip(velocities, places, strict=True)):
+            if state.self_collision[number]:
+                shortest = self._little_motion(velocity, shortest)
+            shortest = self.rigid.stable_dt(*velocity, lambda place=place: place, at_most=shortest)
+        for a, b in combinations(range(len(state.names)), 2):
+            apart, closing = (
+                np.abs(each[a][0] - each[b][0]) + sign * (each[a][1] + each[b][1])
+                for each, sign in ((places, -1.0), (velocities, 1.0))
+            )
+            room = float(np.linalg.norm(np.maximum(apart, 0.0))) - self._pairs.thickness
+            from_far = 0.5 * room / max(float(np.linalg.norm(closing)), 1.0e-30)
+            together = self._little_motion((velocities[a][0], 0.5 * closing), shortest)
+            shortest = min(shortest, max(together, from_far))
+        return shortest
+
+    def _box(self, vectors: ti.Ndarray, first: int, end: int) -> Box:
+        return box_of(vectors, int(first), int(end), self._ends)
+
+    def _little_motion(self, velocity: Box, at_most: float) -> float:
+        """Largest step [s] in which cloth with such a box of velocities [m/s] moves little against itself."""
+        return min(at_most, LARGEST_MOTION * self._pairs.mean_edge / max(float(np.linalg.norm(velocity[1])), 1.0e-30))
 
     def begin_frame(self) -> None:
         """Count anew, and expect of contacts what a run does that continues here."""
@@ -155,7 +184,8 @@ class ContinuousContacts:
         # Pairs that have not followed the cloth for a while find, as they look, how far it is from where they left it.
         self._near = self._pairs if self._meets_cloth else self._lone
         self._near.begin_frame(state)
-        self.rigid.set_thickness(self._near.thickness)
+        self.rigid.set_thickness(float(copied(state.thickness).min()), self._near.thickness)
+        self.rigid.bodies.begin_frame()
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())
@@ -166,7 +196,8 @@ class ContinuousContacts:
         `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
         that had to move with others, `crossings_left` pairs that even so may have crossed, as where pins are led
         through each other; all summed over the substeps. `jammed` is 1 in a frame with a cloth of which impact zones
-        moved more than `JAMMED_SHARE`, on average over the substeps.
+        moved more than `JAMMED_SHARE`, on average over the substeps; `bodies_show` in one where cloth was deeper in a
+        body than it is thick.
         """
         body = self._state.host.body
         nodes = np.bincount(body, minlength=len(self._moved_as_one))
@@ -178,6 +209,7 @@ class ContinuousContacts:
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
             "jammed": float(is_jammed.any()),
+            "bodies_show": float(copied(self.rigid.bodies.depth).max() > 1.0),
         }
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -6,7 +6,3 @@ roughly, as are those below, from processor times at 128 x 128 nodes."""
 
 CONTACT_NS, PATCH_AT_WALLS_NS = 25.0, 90.0
 """Work of one step of the iteration a contact, and of looking for walls a patch [ns]."""
-
-NODE_AT_BODIES_NS, PATCH_AT_BODY_NS = 20.0, 10.0
-"""Work of looking for bodies [ns]: a node, or a point between nodes, of which a part touches one; and a patch, of which
-most touch none, for each body."""

@@ -26,7 +26,7 @@ class Patches:
 
     Attributes:
         count: number of patches, m.
-        vertex_count: of all patches, n; `between_count` is the number of their edges and triangles.
+        vertex_count: of all patches, n.
         leaves: m rounded up to a power of two.
         first_triangle, first_edge, first_vertex: of each patch, (m + 1,).
         triangles: in the order of the patches, (k,) ivec3 of vertices; edges (e,) ivec2; vertices (n,).
@@ -43,7 +43,6 @@ class Patches:
         patch = _patch_of_triangles(host)
         self.count = int(patch.max()) + 1 if len(patch) else 0
         self.vertex_count = len(host.position)
-        self.between_count = len(edges) + len(triangles)
         self.leaves = 1 << max(self.count - 1, 0).bit_length()
         order = np.argsort(patch, kind="stable")
         self.first_triangle = _array(_starts(patch, self.count))

@@ -8,15 +8,25 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import CollidingBodies, Contacts, Four, PatchElements, PatchMotion, PatchNodes, Surface, Walls
-from sim.cloth.loop_costs import NODE_AT_BODIES_NS, PATCH_AT_BODY_NS, PATCH_AT_WALLS_NS
+from sim.cloth.bundles import (
+    CollidingBodies,
+    Contacts,
+    Four,
+    PatchElements,
+    PatchMotion,
+    PatchNodes,
+    Surface,
+    Three,
+    Walls,
+)
+from sim.cloth.loop_costs import PATCH_AT_WALLS_NS
 from sim.cloth.patches import Patches
-from sim.cloth.proximity import unit_or
+from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision_kernels import LANES
 from sim.cloth.state import ClothState
-from sim.core.arrays import Integers
+from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.motion.paths import Poses
@@ -24,7 +34,7 @@ from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
 from sim.core.walls import Wall
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.device_shapes import distance_to
+from sim.shapes.device_shapes import GRID, SPHERE, TORUS, Shapes, distance_to
 
 Array = NDArray[np.float64]
 
@@ -39,10 +49,21 @@ WALL_DEPTH = 4.0
 """Walls hold what is at most so far behind them, in thicknesses, or as far as a mean edge or the node's motion in the
 step, if that is more: what left through an open face falls on outside."""
 
-SMALL_BODY = 4.0
-"""Round bodies with a shorter edge, in mean edges of the cloth, are looked at between its vertices, too: larger ones
-show by an eighth of an edge at most where vertices alone meet them."""
+OF_TRIANGLES = 0.75
+"""Part of their distance from bodies that triangles keep between their vertices, which alone push flat bodies then."""
 
+SEARCH_LEVELS = 5
+"""How often the deepest point of a triangle is looked for around the last: to a 24th of its edges."""
+
+AT_CORNER = 0.98
+"""What has this barycentric coordinate is a vertex."""
+
+WITH_EDGES = 2
+"""In `CollisionBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one
+point does not hold it: it turns about that."""
+
+Corners = ti.types.matrix(3, 3, ti.f32)
+"""Those of a triangle, in rows."""
 
 WITH_ROUNDING = 1.00001
 """Bounds of how far patches reach and move are so much larger than computed: float32 loses some 1e-7 of them."""
@@ -70,9 +91,8 @@ class BodyMotion:
 class RigidContact:
     """Finds where cloth touches bodies and walls.
 
-    Cloth stays half its thickness away from both. Its vertices are looked at, and where a body has sharp edges or is
-    small (`set_spacing`) also the midpoints of its edges and triangles: so much of a corner may show through cloth as
-    fits between them, and a body that fits between them, thinner than 0.7 edges or so, passes.
+    Cloth stays half its thickness away from both. Its vertices are looked at, and where a body may show between them,
+    as it is sharp, small or thinly covered (`CollisionBodies.sag`), the deepest point of each triangle.
     The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
     by less than `LARGEST_ADVANCE` (`stable_dt`).
 
@@ -89,8 +109,8 @@ class RigidContact:
         self._radius = np.array([geometry.radius for geometry in geometries])
         self._position = self._velocity = np.zeros((len(geometries), 3))
         self._spin_speed = np.zeros(len(geometries))
-        self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
-        self._spacing, self._largest_half = 0.0, 0.0
+        self._shows = np.zeros(len(geometries), dtype=bool)
+        self._spacing, self._longest, self._largest_half = 0.0, 0.0, 0.0
         self._taken = ti.ndarray(ti.i32, 1)
         room = max(len(walls), 1)
         corners = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(4))
@@ -111,15 +131,17 @@ class RigidContact:
             self._walls.joined_low.from_numpy(joined[1.0].astype(np.float32))
             self._walls.joined_high.from_numpy(joined[-1.0].astype(np.float32))
 
-    def set_spacing(self, mean_edge: float) -> None:
-        """Say how far vertices of the coarsest cloth are apart [m]: what is small, and how deep walls hold."""
-        self._spacing = mean_edge
-        self.bodies.look_between_vertices(SMALL_BODY * mean_edge)
-        self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
+    def set_spacing(self, mean_edge: float, longest: float) -> None:
+        """Say how long edges of the coarsest cloth are, and the longest of all [m]."""
+        self._spacing, self._longest = mean_edge, longest
 
-    def set_thickness(self, largest: float) -> None:
-        """Say how thick the cloth is at most [m]."""
+    def set_thickness(self, least: float, largest: float) -> None:
+        """Say how thick cloths are at least and at most [m]: where they can be bodies may show between vertices."""
         self._largest_half = 0.5 * largest
+        shows = self.bodies.sag(self._longest) > 0.5 * (1.0 - OF_TRIANGLES) * least
+        if (shows != self._shows).any():
+            self._shows = shows
+            self.bodies.look_at_triangles(shows)
 
     def place(self, poses: Poses, motion: BodyMotion | None = None) -> None:
         """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
@@ -202,7 +224,6 @@ class RigidContact:
         if not self.bodies.count:
             return
         workers, bodies = workers_for(patches.count * lanes), self.bodies.colliding
-        few_bodies = is_short(patches.count * bodies.count, PATCH_AT_BODY_NS)
         find_body_contacts_of_vertices(
             patches.vertex_lists,
             lanes,
@@ -211,13 +232,13 @@ class RigidContact:
             motion,
             self._largest_half,
             state.surface,
+            state.inverse_mass,
             bodies,
             recovery,
             contacts.found,
-            few_bodies and is_short(patches.vertex_count, NODE_AT_BODIES_NS),
         )
-        if self._has_edges:
-            find_body_contacts_between_vertices(
+        if self._shows.any():
+            find_body_contacts_of_triangles(
                 patches.elements,
                 lanes,
                 workers,
@@ -225,10 +246,10 @@ class RigidContact:
                 motion,
                 self._largest_half,
                 state.surface,
+                state.inverse_mass,
                 bodies,
                 recovery,
                 contacts.found,
-                few_bodies and is_short(patches.between_count, NODE_AT_BODIES_NS),
             )
 
 
@@ -303,47 +324,80 @@ def may_touch_bodies(m: ti.i32, patch: PatchMotion, largest_half: ti.f32, bodies
 
 
 @func
-def touch_bodies(
+def touch_body(
+    b: ti.i32,
     x: ti.math.vec3,
     u: ti.math.vec3,
-    half: ti.f32,
+    keeps: ti.f32,
     own_friction: ti.f32,
     corners: Four,
     weight: ti.math.vec4,
-    only_edged: ti.template(),
+    is_vertex: ti.template(),
+    across: ti.math.mat3,
+    half: ti.f32,
     recovery: ti.f32,
     bodies: CollidingBodies,
     contacts: Contacts,
 ):
-    """Append the bodies that a point of the cloth, at x with displacement u, comes nearer than half its thickness."""
-    for b in range(bodies.count):
-        r = x - bodies.position[b]
-        relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
-        reach = bodies.radius[b] + half + relative.norm()
-        looked_at = 1 if ti.static(not only_edged) else bodies.has_edges[b]
-        if looked_at == 1 and r.norm_sqr() < reach * reach:
-            turned = bodies.rotation[b]
-            y = turned.transpose() @ r + bodies.centre_of_mass[b]
-            distance = distance_to(y, b, bodies.shapes)
-            if distance < half + relative.norm():
-                gradient = ti.math.vec3(0.0)
-                for axis in ti.static(range(3)):
-                    ahead = ti.math.vec3(0.0)
-                    ahead[axis] = bodies.step[b]
-                    gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
-                n = turned @ unit_or(gradient, y)
-                least = least_displacement(distance, half, recovery)
-                if distance < half or n.dot(relative) < least:
-                    slot = ti.atomic_add(contacts.counter[0], 1)
-                    if slot < contacts.capacity:
-                        contacts.vertices[slot], contacts.weights[slot], contacts.normal[slot], contacts.floor[slot] = (
-                            corners,
-                            weight,
-                            n,
-                            least,
-                        )
-                        contacts.kind[slot], contacts.arm[slot] = b, r
-                        contacts.friction[slot] = ti.sqrt(own_friction * bodies.friction[b])
+    """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps.
+
+    Of its gradient there only what is `across` the element counts in which this point is the nearest to the body: on
+    an edge of the body gradients are those of its faces, which would push the element along itself. How deep it is gets
+    noted in thicknesses, if `half` of that is not 0.
+    """
+    r = x - bodies.position[b]
+    relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
+    reach = bodies.radius[b] + keeps + relative.norm()
+    if r.norm_sqr() < reach * reach:
+        turned = bodies.rotation[b]
+        y = turned.transpose() @ r + bodies.centre_of_mass[b]
+        distance = distance_to(y, b, bodies.shapes)
+        if distance < 0.0 and half > 0.0:
+            ti.atomic_max(bodies.depth[b], -0.5 * distance / half)
+        if distance < keeps + relative.norm():
+            gradient = ti.math.vec3(0.0)
+            for axis in ti.static(range(3)):
+                ahead = ti.math.vec3(0.0)
+                ahead[axis] = bodies.step[b]
+                gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
+            n = turned @ unit_or(gradient, y)
+            if ti.static(not is_vertex):
+                n = unit_or(across @ n, n)
+            least = least_displacement(distance, keeps, recovery)
+            if distance < keeps or n.dot(relative) < least:
+                slot = ti.atomic_add(contacts.counter[0], 1)
+                if slot < contacts.capacity:
+                    contacts.vertices[slot], contacts.weights[slot] = corners, weight
+                    contacts.normal[slot], contacts.floor[slot] = n, least
+                    contacts.kind[slot], contacts.arm[slot] = b, r
+                    contacts.friction[slot] = ti.sqrt(own_friction * bodies.friction[b])
+
+
+@func
+def deepest_on_triangle(y: Corners, in_middle: ti.f32, b: ti.i32, shapes: Shapes) -> ti.math.vec3:
+    """Barycentric coordinates of the point of a triangle, in the frame of a shape, that is deepest in it or nearest.
+
+    Of balls exact. Else the best of six points around the best so far, ever nearer, from the middle on: distances to
+    convex bodies have no minimum but one.
+    """
+    best, least, step = ti.math.vec3(1.0 / 3.0), in_middle, 1.0 / 3.0
+    if shapes.kind[b] == SPHERE:
+        best = closest_on_triangle(ti.math.vec3(0.0), y[0, :], y[1, :], y[2, :])
+    else:
+        for level in range(SEARCH_LEVELS):
+            around = best
+            for k in range(6):
+                way = ti.math.vec3(ti.cast(k % 3 == 0, ti.f32) - ti.cast(k % 3 == 2, ti.f32), 0.0, 0.0)
+                way[1] = ti.cast(k % 3 == 1, ti.f32) - ti.cast(k % 3 == 0, ti.f32)
+                way[2] = -way[0] - way[1]
+                share = ti.max(around + ti.select(k < 3, step, -step) * way, 0.0)
+                share /= share.sum()
+                distance = distance_to(y.transpose() @ share, b, shapes)
+                if distance < least:
+                    least, best = distance, share
+            if level > 0:
+                step *= 0.5
+    return best
 
 
 @kernel
@@ -355,15 +409,16 @@ def find_body_contacts_of_vertices(
     motion: PatchMotion,
     largest_half: ti.f32,
     surface: Surface,
+    inverse_mass: Floats,
     bodies: CollidingBodies,
     recovery: ti.f32,
     contacts: Contacts,
-    is_short: ti.template(),
 ):
-    """Append the contacts of vertices with bodies."""
+    """Append the contacts of vertices with bodies.
+
+    Parallel however few there are: compiled twice, normals would be rounded differently.
+    """
     begin_sharing(taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < listed.count * lanes:
@@ -372,24 +427,28 @@ def find_body_contacts_of_vertices(
             place = ti.select(may_touch == 1, listed.first[m], listed.first[m + 1]) + item % lanes
             while place < listed.first[m + 1]:
                 i = listed.nodes[place]
-                touch_bodies(
-                    surface.position[i],
-                    surface.displacement[i],
-                    0.5 * surface.thickness[i],
-                    surface.friction[i],
-                    Four(i),
-                    ti.math.vec4(1.0, 0.0, 0.0, 0.0),
-                    False,
-                    recovery,
-                    bodies,
-                    contacts,
-                )
+                for b in range(bodies.count):
+                    touch_body(
+                        b,
+                        surface.position[i],
+                        surface.displacement[i],
+                        0.5 * surface.thickness[i],
+                        surface.friction[i],
+                        Four(i),
+                        ti.math.vec4(1.0, 0.0, 0.0, 0.0),
+                        True,
+                        ti.Matrix.identity(ti.f32, 3),
+                        ti.select(inverse_mass[i] > 0.0, 0.5 * surface.thickness[i], 0.0),
+                        recovery,
+                        bodies,
+                        contacts,
+                    )
                 place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
 
 
 @kernel
-def find_body_contacts_between_vertices(
+def find_body_contacts_of_triangles(
     elements: PatchElements,
     lanes: ti.i32,
     workers: ti.i32,
@@ -397,51 +456,104 @@ def find_body_contacts_between_vertices(
     motion: PatchMotion,
     largest_half: ti.f32,
     surface: Surface,
+    inverse_mass: Floats,
     bodies: CollidingBodies,
     recovery: ti.f32,
     contacts: Contacts,
-    is_short: ti.template(),
 ):
-    """Append the contacts of midpoints of edges and triangles with bodies that have edges of their own."""
+    """Append the contacts of triangles, each at its deepest point, with bodies that may show between vertices."""
     begin_sharing(taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < elements.count * lanes:
             m = item // lanes
             may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-            place = ti.select(may_touch == 1, elements.first_edge[m], elements.first_edge[m + 1]) + item % lanes
-            while place < elements.first_edge[m + 1]:
-                a, b = elements.edges[place][0], elements.edges[place][1]
-                touch_bodies(
-                    0.5 * (surface.position[a] + surface.position[b]),
-                    0.5 * (surface.displacement[a] + surface.displacement[b]),
-                    0.5 * surface.thickness[a],
-                    surface.friction[a],
-                    Four(a, b, a, a),
-                    ti.math.vec4(0.5, 0.5, 0.0, 0.0),
-                    True,
-                    recovery,
-                    bodies,
-                    contacts,
-                )
-                place += lanes
-            place = ti.select(may_touch == 1, elements.first_triangle[m], elements.first_triangle[m + 1]) + item % lanes
-            while place < elements.first_triangle[m + 1]:
-                a, b, c = elements.triangles[place][0], elements.triangles[place][1], elements.triangles[place][2]
-                third = 1.0 / 3.0
-                touch_bodies(
-                    third * (surface.position[a] + surface.position[b] + surface.position[c]),
-                    third * (surface.displacement[a] + surface.displacement[b] + surface.displacement[c]),
-                    0.5 * surface.thickness[a],
-                    surface.friction[a],
-                    Four(a, b, c, a),
-                    ti.math.vec4(third, third, third, 0.0),
-                    True,
-                    recovery,
-                    bodies,
-                    contacts,
-                )
+            # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
+            edges = elements.first_edge[m + 1] - elements.first_edge[m]
+            end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
+            place = ti.select(may_touch == 1, item % lanes, end)
+            while place < end:
+                corners = Three(0)
+                if place < edges:
+                    ends = elements.edges[elements.first_edge[m] + place]
+                    corners = Three(ends[0], ends[1], ends[1])
+                else:
+                    corners = elements.triangles[elements.first_triangle[m] + place - edges]
+                for b in range(bodies.count):
+                    if bodies.shows[b] > ti.cast(place < edges, ti.i32):
+                        touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)
                 place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
+
+
+@func
+def touch_triangle(
+    b: ti.i32,
+    corners: Three,
+    surface: Surface,
+    inverse_mass: Floats,
+    recovery: ti.f32,
+    bodies: CollidingBodies,
+    contacts: Contacts,
+):
+    """Append a body if it comes too near to a triangle between its corners, or to an edge: a, b, b.
+
+    What is nearest at an edge is left to that where edges are looked at, too. A triangle with a corner that a pin holds
+    in the body is where the job wants it. The distance to a convex body is a convex function: it sags nowhere below
+    that between the corners by more than three times what it does in their middle.
+    """
+    v, third = corners, 1.0 / 3.0
+    half = 0.5 * surface.thickness[v[0]]
+    y, u, x = Corners(0.0), Corners(0.0), Corners(0.0)
+    farthest, nearest = 0.0, 1.0e30
+    for k in ti.static(range(3)):
+        r = surface.position[v[k]] - bodies.position[b]
+        relative = surface.displacement[v[k]] - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
+        farthest, nearest = ti.max(farthest, relative.norm()), ti.min(nearest, r.norm())
+        at = bodies.rotation[b].transpose() @ r + bodies.centre_of_mass[b]
+        for axis in ti.static(range(3)):
+            x[k, axis], u[k, axis] = surface.position[v[k]][axis], surface.displacement[v[k]][axis]
+            y[k, axis] = at[axis]
+    size = ti.max((y[1, :] - y[0, :]).norm(), (y[2, :] - y[0, :]).norm())
+    if nearest < bodies.radius[b] + half + size + farthest:
+        in_middle = distance_to(y.transpose() @ ti.math.vec3(third), b, bodies.shapes)
+        # Outside of its grid a distance is at most three times too large: the body is in the grid, it is 1-Lipschitz.
+        is_grid = bodies.shapes.kind[b] == GRID
+        if ti.select(is_grid, third * in_middle, in_middle) < half + size + farthest:
+            sag, is_held = -in_middle, False
+            for k in range(3):
+                share = ti.math.vec3(ti.cast(k == 0, ti.f32), ti.cast(k == 1, ti.f32), ti.cast(k == 2, ti.f32))
+                distance = distance_to(y.transpose() @ share, b, bodies.shapes)
+                sag += third * distance
+                held = ti.select(k == 0, v[0], ti.select(k == 1, v[1], v[2]))
+                if inverse_mass[held] == 0.0 and distance < 0.0:
+                    is_held = True
+            is_convex = not is_grid and bodies.shapes.kind[b] != TORUS
+            if not is_held and not (is_convex and 3.0 * sag < (1.0 - OF_TRIANGLES) * half):
+                share = deepest_on_triangle(y, in_middle, b, bodies.shapes)
+                across = ti.Matrix.identity(ti.f32, 3)
+                if v[1] == v[2]:
+                    along = unit_or(x[1, :] - x[0, :], x[2, :])
+                    across -= along.outer_product(along)
+                    share = ti.math.vec3(share[0], share[1] + share[2], 0.0)
+                elif bodies.shows[b] == WITH_EDGES:
+                    n = unit_or((x[1, :] - x[0, :]).cross(x[2, :] - x[0, :]), x[2, :])
+                    across = n.outer_product(n)
+                    if share.min() < 1.0 - AT_CORNER:
+                        share[0] = 1.0
+                if share.max() < AT_CORNER:
+                    touch_body(
+                        b,
+                        x.transpose() @ share,
+                        u.transpose() @ share,
+                        OF_TRIANGLES * half,
+                        surface.friction[v[0]],
+                        Four(v[0], v[1], v[2], v[0]),
+                        ti.math.vec4(share[0], share[1], share[2], 0.0),
+                        False,
+                        across,
+                        half,
+                        recovery,
+                        bodies,
+                        contacts,
+                    )

@@ -26,7 +26,8 @@ class CollisionBodies(DeviceShapes):
     """All bodies that cloth may touch: those that move, then those that stand still.
 
     Attributes:
-        has_edges: whether more than vertices must be looked at, as the shape has sharp edges or is small, (b,).
+        shows: whether it may show between vertices, so that triangles are looked at; 2 if edges are, too, (b,).
+        depth: how deep free cloth was in each at most since `begin_frame`, in its thicknesses, (b,).
         friction: [-], (b,).
         position: centre of mass at the start of the substep [m], (b,) vec3.
         rotation: body axes to world axes, (b,) mat3.
@@ -47,8 +48,10 @@ class CollisionBodies(DeviceShapes):
     def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float]) -> None:
         super().__init__(geometries)
         room = max(self.count, 1)
-        self.has_edges = ti.ndarray(ti.i32, room)
-        self.friction, self.inverse_mass = (ti.ndarray(ti.f32, room) for _ in range(2))
+        self.shows = ti.ndarray(ti.i32, room)
+        self.shows.fill(0)
+        self.friction, self.inverse_mass, self.depth = (ti.ndarray(ti.f32, room) for _ in range(3))
+        self.begin_frame()
         self.position = ti.Vector.ndarray(3, ti.f32, room)
         self.motion, self.motion_start, self.motion_reached = (ti.Vector.ndarray(3, ti.f32, 2 * room) for _ in range(3))
         self.rotation, self.inverse_inertia = (ti.Matrix.ndarray(3, 3, ti.f32, room) for _ in range(2))
@@ -60,7 +63,6 @@ class CollisionBodies(DeviceShapes):
         self.may_move = False
         if self.count:
             self.set_friction(np.asarray(friction, dtype=np.float64))
-            self.look_between_vertices(0.0)
 
     @property
     def colliding(self) -> CollidingBodies:
@@ -68,7 +70,8 @@ class CollisionBodies(DeviceShapes):
         return CollidingBodies(
             count=self.count,
             shapes=self.on_device,
-            has_edges=self.has_edges,
+            shows=self.shows,
+            depth=self.depth,
             centre_of_mass=self.centre_of_mass,
             radius=self.radius,
             step=self.step,
@@ -95,6 +98,10 @@ class CollisionBodies(DeviceShapes):
             load_unit=self.load_unit,
         )
 
+    def begin_frame(self) -> None:
+        """Note anew how deep cloth gets."""
+        self.depth.fill(0.0)
+
     def set_friction(self, friction: Array) -> None:
         """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""
         if self.count:
@@ -120,11 +127,18 @@ class CollisionBodies(DeviceShapes):
         mobility = inverse_mass + reach**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
         self.load_unit = LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0
 
-    def look_between_vertices(self, length: float) -> None:
-        """Look at more than vertices where a body has sharp edges, or its box an edge that is shorter [m]."""
-        if self.count:
-            is_small = np.array([geometry.shortest_edge < length for geometry in self.geometries])
-            self.has_edges.from_numpy((~np.isin(self.on_device.kind.to_numpy(), _ROUND) | is_small).astype(np.int32))
+    def sag(self, edge: float) -> Array:
+        """How far each body shows at most through triangles with such an edge whose vertices touch it [m], (b,).
+
+        What is sharp, or read from a grid, may show by any height.
+        """
+        size, kind = (each.to_numpy()[: self.count] for each in (self.on_device.size, self.on_device.kind))
+        radius = np.where(kind == TORUS, size[:, 1], size[:, 0])
+        return np.where(np.isin(kind, _ROUND), edge**2 / (6.0 * np.maximum(radius, 1.0e-30)), np.inf)
+
+    def look_at_triangles(self, shows: NDArray[np.bool_]) -> None:
+        """Say which bodies may show between vertices, (b,)."""
+        put(self.shows, np.where(self.on_device.kind.to_numpy()[: self.count] == SPHERE, 1, 2) * shows)
 
     def set_motion(self, shift: Array, turn: Array) -> None:
         """Say how the bodies would move in a substep without cloth.

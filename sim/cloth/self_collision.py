@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sim.cloth.state import ClothState
 
 Array = NDArray[np.float64]
+Box = tuple[Array, Array]
 
 REACH_IN_EDGES = 0.85
 LEAST_SKIN_IN_EDGES = 0.15
@@ -46,7 +47,7 @@ class SelfCollision:
         with_triangles, of_edges: the listed pairs.
         thickness: the largest [m].
         mean_edge: at rest, of all cloths together [m]; how far lists reach.
-        coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart.
+        coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart. `longest_edge` of all.
         searches: how many pairs of patches were searched since `begin_frame`, over the number of patches.
 
     Args:
@@ -64,7 +65,7 @@ class SelfCollision:
         self.of_edges = PairList(capacity=state.edge_count, pieces=self._met.capacity)
         edges = state.host.position[state.host.edges]
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
-        self.mean_edge = float(lengths.mean())
+        self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
         cloth_of = state.host.body[state.host.edges[:, 0]]
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
         self.thickness = 0.0
@@ -216,14 +217,15 @@ class SelfCollision:
         )
 
 
-def box_of(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple[Array, Array]:
+def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Box:
     """Middle and half edges of the box around vectors, (3,) each, the same whatever their order.
 
     Args:
-        vectors: of which the first `count` are looked at.
-        count: at least 1.
+        vectors: of which those from `first` up to `end` are looked at, at least one.
+        first, end: numbers.
         ends_of: of six maxima.
     """
-    numbers = range_of_vectors(vectors, count, ends_of.over(count), is_short(count, NODE_NS))
+    count = end - first
+    numbers = range_of_vectors(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
     ends = ends_of.unpack(numbers).astype(np.float64)
     return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])

@@ -478,8 +478,8 @@ def look_at_pair(
 
 
 @kernel
-def range_of_vectors(vectors: Vectors, count: ti.i32, share: Share, is_short: ti.template()) -> Results:
-    """Largest components, then those of the negative vectors, six maxima."""
+def range_of_vectors(vectors: Vectors, first: ti.i32, count: ti.i32, share: Share, is_short: ti.template()) -> Results:
+    """Largest components of some vectors, then those of the negative ones, six maxima."""
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for lane in range(share.tree.lanes):
@@ -487,7 +487,7 @@ def range_of_vectors(vectors: Vectors, count: ti.i32, share: Share, is_short: ti
         for k in range(share.items):
             i = lane * share.lane_step + k * share.item_step
             if i < count:
-                most, least = ti.max(most, vectors[i]), ti.min(least, vectors[i])
+                most, least = ti.max(most, vectors[first + i]), ti.min(least, vectors[first + i])
         for axis in ti.static(range(3)):
             (
                 share.tree.partial[axis * share.tree.lanes + lane],

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 CASES = (
     "kernel", "hydrostatic", "dam-break", "elliptical-drop", "viscosity", "free-momentum", "coupled-momentum",
-    "rigid-motion", "rigid-contacts", "inertia", "cloth", "smoke-vortices", "smoke-projection", "smoke-plume",
-    "smoke-front", "smoke-mass", "submerged-sphere", "buoyancy", "bunny-energy",
+    "rigid-motion", "rigid-contacts", "inertia", "cloth", "cloth-crossings", "smoke-vortices", "smoke-projection",
+    "smoke-plume", "smoke-front", "smoke-mass", "submerged-sphere", "buoyancy", "bunny-energy",
 )  # fmt: skip
 """In the order in which they are computed; each in the module of its name."""
 
