@@ -31,9 +31,9 @@ class XPBDSprings:
     from cloths that no pin holds.
 
     Approximate: one sweep a step does not let a stiff spring know of all that hangs on it. A spring alone, of a colour
-    that comes early, stretches by 2 n g dt² more than it should if n nodes hang on it, whatever its stiffness; the last
-    spring of a piece of thread by n g dt², and those within a piece by nothing. That falls with the square of the step,
-    and with every further sweep. Bend springs have one sweep always.
+    that comes early, stretches by 2 n g dt² more than it should if n nodes hang on it, whatever its stiffness; those of
+    a thread by nothing. That falls with the square of the step, and with every further sweep. Bend springs have one
+    sweep always.
 
     Args:
         state: what they move.

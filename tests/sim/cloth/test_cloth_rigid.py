@@ -1,9 +1,21 @@
 """Cloth against bodies and walls: distances on the device, momentum both ways, friction, no passing through."""
 
+import math
+
 import numpy as np
 import pytest
 import taichi as ti
-from cloth_scenes import EARTH, GRAVITY, SOFT, WEIGHTLESS, cloth, rectangle, solver_of, spring_energy
+from cloth_scenes import (
+    EARTH,
+    FRAMES_PER_SECOND,
+    GRAVITY,
+    SOFT,
+    WEIGHTLESS,
+    cloth,
+    rectangle,
+    solver_of,
+    spring_energy,
+)
 from contact_scenes import SPACE, cloth_of, contacts_of, displace, distances_to_body, momenta, rigid_of, world_of
 from device_distances import measure_distances
 
@@ -492,3 +504,71 @@ def test_cloth_over_a_sphere_comes_to_rest_on_it_without_crossings():
             # Half a thickness off; folds that are pulled against it press some nodes nearer.
             assert np.linalg.norm(x - [0.0, 0.0, 0.2], axis=1).min() > 0.15
     assert solver.state.positions()[:, 2].max() == pytest.approx(0.3515, abs=2e-3)
+
+
+# --- friction around a bar ------------------------------------------------------------------------------------------
+
+BAR, SPACING, SHORT_END = 0.05, 0.0125, 0.4
+
+
+def strip_over_a_bar(ratio, friction):
+    """A strip that hangs over a fixed bar, with one end, to the left, so many times as long as the other."""
+    long_end, arc = ratio * SHORT_END, math.pi * BAR
+    columns = round((long_end + arc + SHORT_END) / SPACING) + 1
+    bar = {
+        "name": "bar",
+        "shape": {"type": "cylinder", "radius": BAR, "height": 0.4},
+        "rotation_deg": (90.0, 0.0, 0.0),
+        "friction": friction,
+    }
+    size = (long_end + arc + SHORT_END, 4 * SPACING)
+    sheet = {"shape": rectangle(size, (columns, 5)), "position": (0.0, 0.0, 0.5), "friction": friction}
+    world = world_of({**sheet, "self_collision": False}, bodies=[bar], domain=SPACE)
+    state = cloth_of(world).state
+    x, y, _ = state.positions().T
+    along, radius = x - x.min(), BAR + 0.5 * state.thickness.to_numpy()[0] + 1.0e-4
+    angle = np.clip((along - long_end) / arc, 0.0, 1.0) * math.pi
+    below = np.where(along < long_end, long_end - along, np.maximum(along - long_end - arc, 0.0))
+    state.set_positions(np.stack([-radius * np.cos(angle), y, radius * np.sin(angle) - below], axis=1))
+    return world
+
+
+def acceleration_of_a_belt(ratio, slid, speed, friction):
+    """Of a belt over a bar [m/s²], by the equation of Euler's belt with its own mass,
+
+    dT/dphi = lambda R (a + g cos phi) + mu (T - lambda v² + lambda R g sin phi),   0 < phi < pi,
+
+    between the tensions of the ends, which hang: linear in a, so that two guesses say which one is right.
+    """
+    phi = np.linspace(0.0, math.pi, 200)
+    missing = []
+    for a in (0.0, 1.0):
+        tension = (SHORT_END - slid) * (GRAVITY + a)
+        for at, step in zip(phi[:-1], np.diff(phi), strict=True):
+            pressing = tension - speed**2 + BAR * GRAVITY * math.sin(at)
+            tension += step * (BAR * (a + GRAVITY * math.cos(at)) + friction * pressing)
+        missing.append((ratio * SHORT_END + slid) * (GRAVITY - a) - tension)
+    return missing[0] / (missing[0] - missing[1])
+
+
+@pytest.mark.parametrize(("ratio", "slides"), [(1.9, False), (3.0, True)])
+def test_a_strip_over_a_bar_holds_and_slides_as_eulers_belt_does(ratio, slides):
+    """With 0.25 as the coefficient, ends hold each other up to exp(pi/4) = 2.19 times the length.
+
+    Where springs that move after contacts kept nodes out of the bar by themselves, friction would not feel them.
+    """
+    friction, settled, frames = 0.25, 6, 24
+    world = strip_over_a_bar(ratio, friction)
+    state = cloth_of(world).state
+    end = state.positions()[:, 2] < -ratio * SHORT_END + 0.5 * SPACING
+    start = state.positions()[end, 2].mean()
+    for frame in range(frames):
+        if frame == settled:  # it starts with a little slack
+            expected, speed = start - state.positions()[end, 2].mean(), -state.velocity.to_numpy()[end, 2].mean()
+        world.advance_frame()
+    slid, dt = start - state.positions()[end, 2].mean(), 0.1 / FRAMES_PER_SECOND
+    for _ in range(10 * (frames - settled)):
+        speed += dt * acceleration_of_a_belt(ratio, expected, speed, friction) if slides else -speed
+        expected += dt * speed
+    assert (slid > 0.05) == slides
+    assert slid == pytest.approx(expected, rel=0.03, abs=1e-3)

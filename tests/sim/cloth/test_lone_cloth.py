@@ -37,7 +37,8 @@ def test_spheres_around_patches_and_their_displacements_hold_all_corners():
 def test_a_lone_cloth_moves_as_if_its_pairs_had_been_looked_for():
     """Bodies push it at once by far more than its thickness, on the floor and off it."""
     box = {**BALL, "shape": {"type": "box", "size": (0.06, 0.06, 0.06)}, "position": (0.07, 0.07, 0.12)}
-    worlds = [world_of({**SHEET, "position": (0.0, 0.0, 0.02)}, bodies=[BALL, box], domain=ROOM) for _ in range(2)]
+    sheet = {**SHEET, "position": (0.0, 0.0, 0.02), "iterations": 1}  # a second look may have springs take more turns
+    worlds = [world_of(sheet, bodies=[BALL, box], domain=ROOM) for _ in range(2)]
     contacts = contacts_of(cloth_of(worlds[1]))
     contacts._lone = contacts._pairs
     for world in worlds:

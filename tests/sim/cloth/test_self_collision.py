@@ -319,7 +319,7 @@ def test_a_sheet_that_falls_on_its_edge_and_folds_does_not_cross_itself(size, co
         assert numbers["crossings_left"] == 0
         if frame % 5 == 4 or frame == frames - 1:
             assert len(crossings(solver.state.positions(), solver.state.host.triangles)) == 0
-    assert contacts > 0.8 * solver.state.vertex_count
+    assert contacts > 0.5 * solver.state.vertex_count
     assert solver.state.positions()[:, 2].max() < highest
     # Half a thickness above the floor; a few substeps may press it nearer.
     assert solver.state.positions()[:, 2].min() > 0.0
