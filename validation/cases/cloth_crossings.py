@@ -305,7 +305,8 @@ def find(_: str, *, nodes: int, share: float) -> Found:
 
 def judged(rows: Sequence[dict[str, Any]]) -> Found:
     """Checks and curves of what was measured."""
-    checks, series = [], {}
+    checks: list[Check] = []
+    series: dict[str, NDArray[np.float64]] = {}
     for row in rows:
         name = row["scene"]
         untold = [depth for depth, told in zip(row["depth_mm"], row["told"], strict=True) if not told]
