@@ -263,18 +263,18 @@ class ClothSolver:
         """
         integrator, shared = self._integrator, self.parameters[0]
         adapts = shared.iterations is None and shared.substeps is None
-        turns_left = MOST_TURNS if shared.iterations is None else 0
+        turns, most_turns = 0, MOST_TURNS if shared.iterations is None else 0
         integrator.displace(dt, self._sweeps if adapts else shared.iterations or 1)
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
         by_springs = integrator.excess(dt) if adapts and is_loose else 0.0
         excess = by_springs if adapts and is_loose else None
 
         def relax() -> bool:
-            nonlocal turns_left, excess
+            nonlocal turns, excess
             excess = integrator.excess(dt)
-            if not turns_left or excess < RELAXED_BEYOND:
+            if turns == most_turns or excess < RELAXED_BEYOND:
                 return False
-            turns_left -= 1
+            turns += 1
             integrator.sweep(dt)
             return True
 
@@ -285,7 +285,7 @@ class ClothSolver:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
             self._refinement = min(2 * self._refinement, MOST_REFINED)
-        elif self._excess < RESTORED_BELOW and turns_left >= MOST_TURNS - 1:
+        elif self._excess < RESTORED_BELOW and turns < 2:
             self._refinement = max(self._refinement // 2, 1)
         if by_springs < RESTORED_BELOW:
             self._sweeps = max(self._sweeps // 2, 1)
