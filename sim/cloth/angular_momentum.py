@@ -42,17 +42,20 @@ class AngularMomentumCorrection:
         totals = ti.ndarray(ti.f32, QUANTITIES * (self._lanes.count // BRANCHES))
         self._tree = Tree(partial, self._lanes.count, QUANTITIES, 0, totals)
         self._turn = ti.Vector.ndarray(3, ti.f32, 2)
+        self._is_warm = False
 
     def restore(self, dt: float) -> None:
         """Correct the displacements of a step of dt [s], after the springs."""
         state, lanes = self._state, self._lanes
-        for cloth in np.flatnonzero(state.is_free):
+        # At first also for cloths that pins hold, none of whose nodes it moves: it is compiled for when these let go.
+        for cloth in np.flatnonzero(state.is_free) if self._is_warm else range(len(state.names)):
             first, end = (int(node) for node in state.host.first_node[cloth : cloth + 2])
-            count = end - first
+            count = end - first if state.is_free[cloth] else 0
             share = Share(lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._tree)
             return_angular_momentum(
-                state.nodes, state.motion, dt, first, count, share, self._turn, is_short(count, NODE_NS)
+                state.nodes, state.motion, dt, first, count, share, self._turn, is_short(end - first, NODE_NS)
             )
+        self._is_warm = True
 
 
 @kernel
