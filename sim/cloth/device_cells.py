@@ -16,8 +16,6 @@ from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 
-Six = ti.types.vector(6, ti.f32)
-
 
 class DeviceCells:
     """Cells with as many nodes each, sorted by colour.
@@ -102,13 +100,35 @@ def weights(cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()) ->
 
 @ti.func
 def shear_of(d_u: ti.math.vec3, d_v: ti.math.vec3):
-    """e_s, and its derivatives by d_u and d_v, (6,)."""
+    """e_s, and its derivatives by d_u and d_v."""
     more, less = d_u + d_v, d_u - d_v
     length, length_less = ti.max(more.norm(), TINY_LENGTH), ti.max(less.norm(), TINY_LENGTH)
     n, m = more / length, less / length_less
     half = ti.sqrt(0.5)
-    by_u, by_v = half * (n - m), half * (n + m)
-    return half * (length - length_less), Six(by_u[0], by_u[1], by_u[2], by_v[0], by_v[1], by_v[2])
+    return half * (length - length_less), half * (n - m), half * (n + m)
+
+
+@ti.func
+def weight_along(by_u: ti.math.vec3, by_v: ti.math.vec3, w: ti.math.vec3):
+    """How easily nodes with the `weights` w change a strain with these derivatives [1/(kg m²)]."""
+    return w[0] * by_u.dot(by_u) + w[1] * by_v.dot(by_v) + 2.0 * w[2] * by_u.dot(by_v)
+
+
+@func
+def push_nodes(
+    s: ti.i32,
+    cells: CellArrays,
+    nodes: Nodes,
+    p_u: ti.math.vec3,
+    p_v: ti.math.vec3,
+    changed: Vectors,
+    arity: ti.template(),
+):
+    """Give the nodes of a cell what pushes along d_u and d_v change of displacements or velocities."""
+    for a in ti.static(range(arity)):
+        i = cells.nodes[arity * s + a]
+        push = cells.along[arity * s + a] * p_u + cells.across[arity * s + a] * p_v
+        changed[i] = changed[i] + nodes.inverse_mass[i] * push
 
 
 @func
@@ -148,19 +168,12 @@ def solve_cell(
         p_v = change / length_across * d_v
         d_u += w[2] * p_v
         d_v += w[1] * p_v
-    shear, by = shear_of(d_u, d_v)
-    by_u, by_v = ti.math.vec3(by[0], by[1], by[2]), ti.math.vec3(by[3], by[4], by[5])
-    strength = law[1] * dt_squared
-    weight = w[0] * by_u.dot(by_u) + w[1] * by_v.dot(by_v) + 2.0 * w[2] * by_u.dot(by_v)
+    shear, by_u, by_v = shear_of(d_u, d_v)
+    strength, weight = law[1] * dt_squared, weight_along(by_u, by_v, w)
     before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 2])
     change = -(strength * shear + before) / (strength * weight + 1.0)
     multiplier[STRAINS * s + 2] = before + change
-    p_u += change * by_u
-    p_v += change * by_v
-    for a in ti.static(range(arity)):
-        i = cells.nodes[arity * s + a]
-        push = cells.along[arity * s + a] * p_u + cells.across[arity * s + a] * p_v
-        nodes.displacement[i] = nodes.displacement[i] + nodes.inverse_mass[i] * push
+    push_nodes(s, cells, nodes, p_u + change * by_u, p_v + change * by_v, nodes.displacement, arity)
 
 
 @kernel
@@ -201,17 +214,10 @@ def damp_cell(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt
         p_v = -strength * (n_v.dot(rate_v) + law[2] * n_u.dot(rate_u)) / (strength * w[1] + 1.0) * n_v
         rate_u += w[2] * p_v
         rate_v += w[1] * p_v
-    _, by = shear_of(d_u, d_v)
-    by_u, by_v = ti.math.vec3(by[0], by[1], by[2]), ti.math.vec3(by[3], by[4], by[5])
-    strength = law[1] * law[3] * dt
-    weight = w[0] * by_u.dot(by_u) + w[1] * by_v.dot(by_v) + 2.0 * w[2] * by_u.dot(by_v)
+    _, by_u, by_v = shear_of(d_u, d_v)
+    strength, weight = law[1] * law[3] * dt, weight_along(by_u, by_v, w)
     change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v)) / (strength * weight + 1.0)
-    p_u += change * by_u
-    p_v += change * by_v
-    for a in ti.static(range(arity)):
-        i = cells.nodes[arity * s + a]
-        push = cells.along[arity * s + a] * p_u + cells.across[arity * s + a] * p_v
-        motion.velocity[i] = motion.velocity[i] + nodes.inverse_mass[i] * push
+    push_nodes(s, cells, nodes, p_u + change * by_u, p_v + change * by_v, motion.velocity, arity)
 
 
 @kernel
@@ -249,8 +255,7 @@ def compute_cell_forces(
         rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
         rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
         law = cells.law[s]
-        shear, by = shear_of(d_u, d_v)
-        by_u, by_v = ti.math.vec3(by[0], by[1], by[2]), ti.math.vec3(by[3], by[4], by[5])
+        shear, by_u, by_v = shear_of(d_u, d_v)
         moment = -law[1] * (shear + law[3] * (by_u.dot(rate_u) + by_v.dot(rate_v)))
         f_u, f_v = moment * by_u, moment * by_v
         if ti.static(arity == TRIANGLE):
@@ -310,7 +315,7 @@ def sum_over_cells(
                 d_u = derivative(cells.along, cells, nodes, carry, s, arity)
                 d_v = derivative(cells.across, cells, nodes, carry, s, arity)
                 law = cells.law[s]
-                shear, _ = shear_of(d_u, d_v)
+                shear, _, _ = shear_of(d_u, d_v)
                 energy += 0.5 * law[1] * shear * shear
                 if ti.static(arity == TRIANGLE):
                     e_u, e_v = d_u.norm() - 1.0, d_v.norm() - 1.0

@@ -44,8 +44,7 @@ class RectangleSprings:
         self._state, self._grid = state, grid
         self._blocks = row_blocks(grid.columns, grid.rows)
         room = self._blocks.u_x.shape[0]
-        self._multipliers, self._cell_multipliers = (ti.Vector.ndarray(LANES, ti.f32, room) for _ in range(2))
-        self._strains = tuple(ti.Vector.ndarray(LANES, ti.f32, room) for _ in range(2))
+        self._multipliers, *self._strains = (ti.Vector.ndarray(LANES, ti.f32, room) for _ in range(3))
         self._strips = (strips_of(grid.columns), strips_of(grid.rows))
         self._rectangle = rectangle_of(grid, first_node)
         lengths = (grid.rows, grid.columns)
@@ -97,7 +96,6 @@ class RectangleSprings:
                     state.quantum,
                     dt * dt,
                     int(sweep == 0),
-                    self._cell_multipliers,
                     short,
                 )
             self._solve_threads(dt, is_first=sweep == 0)

@@ -48,6 +48,7 @@ class RowBlocks:
         predicted_x, predicted_y, predicted_z: displacements before any spring acted, upright [m].
         inverse_mass: [1/kg].
         n_x, n_y, n_z, inverse_length, change, factor, tension: of the spring that leads on from the node.
+        cell_multiplier: of the shear of the cell above the node, upright.
         is_taut: whether piece p of the lines of strip s has tension to straighten, at `s * pieces + p`, and from
             `turned` on for turned ones.
         v_x, v_y, v_z, share, free_share: of the air's kernels: velocity [m/s], share in the force on any triangle, and
@@ -63,7 +64,7 @@ class RowBlocks:
         self.u_x, self.u_y, self.u_z, self.inverse_mass = (_blocks(count) for _ in range(4))
         self.predicted_x, self.predicted_y, self.predicted_z = (_blocks(count) for _ in range(3))
         self.n_x, self.n_y, self.n_z, self.inverse_length = (_blocks(count) for _ in range(4))
-        self.change, self.factor, self.tension = (_blocks(count) for _ in range(3))
+        self.change, self.factor, self.tension, self.cell_multiplier = (_blocks(count) for _ in range(4))
         self.is_taut = ti.field(ti.i32, shape=count)
         # The air has done before springs start, and works in the same memory.
         self.v_x, self.v_y, self.v_z = self.predicted_x, self.predicted_y, self.predicted_z

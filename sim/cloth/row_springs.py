@@ -4,7 +4,7 @@ import taichi as ti
 
 from sim.cloth.bundles import Lines, Rectangle
 from sim.cloth.device_springs import TINY_LENGTH
-from sim.cloth.row_blocks import LANES, Block, Blocks, turn_displacements, turn_displacements_back, two_blocks
+from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, two_blocks
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
 
@@ -103,7 +103,6 @@ def solve_cells_in_rows(
     quantum: ti.f32,
     dt_squared: ti.f32,
     is_first: ti.i32,
-    multipliers: Blocks,
     is_short: ti.template(),
 ):
     """The shear of all cells in every second row of cells, from row `parity` on; `solve_cell` has the formula.
@@ -128,7 +127,7 @@ def solve_cells_in_rows(
                 p_x, p_y = two_blocks(blocks.lattice_x, a, a + 1), two_blocks(blocks.lattice_y, a, a + 1)
                 p_z, q_z = two_blocks(blocks.lattice_z, a, a + 1), two_blocks(blocks.lattice_z, b, b + 1)
                 q_x, q_y = two_blocks(blocks.lattice_x, b, b + 1), two_blocks(blocks.lattice_y, b, b + 1)
-                multiplier = multipliers[a]
+                multiplier = blocks.cell_multiplier[a]
                 rise_x, rise_y, rise_z = Block(0.0), Block(0.0), Block(0.0)
                 fall_x, fall_y, fall_z = Block(0.0), Block(0.0), Block(0.0)
                 cells = grid.columns - 1 - k * LANES
@@ -184,7 +183,7 @@ def solve_cells_in_rows(
                     b_x[at + 1] += w_b[at + 1] * rise_x[at]
                     b_y[at + 1] += w_b[at + 1] * rise_y[at]
                     b_z[at + 1] += w_b[at + 1] * rise_z[at]
-                multipliers[a] = multiplier
+                blocks.cell_multiplier[a] = multiplier
                 is_inner = k + 1 < grid.strips
                 keep_two_blocks(blocks.u_x, a, a_x, is_inner)
                 keep_two_blocks(blocks.u_y, a, a_y, is_inner)

@@ -266,8 +266,8 @@ class ClothSolver:
         turns, most_turns = 0, MOST_TURNS if shared.iterations is None else 0
         integrator.displace(dt, self._sweeps if adapts else shared.iterations or 1)
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        by_springs = integrator.excess(dt) if adapts and is_loose else 0.0
-        excess = by_springs if adapts and is_loose else None
+        excess = integrator.excess(dt) if adapts and is_loose else None
+        by_springs = excess or 0.0
 
         def relax() -> bool:
             nonlocal turns, excess
