@@ -352,6 +352,7 @@ def draw(results: Sequence[CaseResult]) -> Figure:
             style = "-" if number < len(SHADES) else ":"
             axes.plot(values, style, color=SHADES[number % len(SHADES)], linewidth=1.0, label=name)
         label_axes(axes, "frame", label, legend=key == "strain")
+    panels[2].set_yscale("log")  # a pellet takes a hundred times as many
     return figure
 
 
