@@ -55,7 +55,7 @@ class SimulateStage(Stage):
     """One task for the whole job: it commits a frame at a time and continues where it stopped."""
 
     name = "simulate"
-    version = 12
+    version = 13
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""

@@ -7,7 +7,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import CellArrays, NodeMotion, Nodes
-from sim.cloth.cells import STRAINS, TRIANGLE, Cells, energies
+from sim.cloth.cells import RECTANGLE, STRAINS, TRIANGLE, Cells, energies
 from sim.cloth.device_springs import TINY_LENGTH, colour_bounds, colour_groups
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.spring_convergence import LARGEST_RESIDUAL
@@ -15,6 +15,10 @@ from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
+
+SHEAR_SWEEPS = 3
+"""Sweeps over the cells of rectangles before the threads: with `over_relaxed` ones shear has its stiffness within a few
+per cent where a cell is up to twice as stiff as the inertia of its nodes, and within 40 % up to nine times."""
 
 
 class DeviceCells:
@@ -109,6 +113,16 @@ def shear_of(d_u: ti.math.vec3, d_v: ti.math.vec3):
 
 
 @ti.func
+def over_relaxed(stiffness):
+    """Factor of the change of a cell's multiplier, whose neighbours will undo a part of it (Young 1954).
+
+    Sweeps begin with multipliers of 0, so that smooth shear converges last: it needs more the stiffer cells are, by
+    k dt² over the inertia of their nodes.
+    """
+    return 1.0 + 0.85 * stiffness / (2.0 + stiffness)
+
+
+@ti.func
 def weight_along(by_u: ti.math.vec3, by_v: ti.math.vec3, w: ti.math.vec3):
     """How easily nodes with the `weights` w change a strain with these derivatives [1/(kg m²)]."""
     return w[0] * by_u.dot(by_u) + w[1] * by_v.dot(by_v) + 2.0 * w[2] * by_u.dot(by_v)
@@ -172,6 +186,8 @@ def solve_cell(
     strength, weight = law[1] * dt_squared, weight_along(by_u, by_v, w)
     before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 2])
     change = -(strength * shear + before) / (strength * weight + 1.0)
+    if ti.static(arity == RECTANGLE):
+        change *= over_relaxed(strength * weight)
     multiplier[STRAINS * s + 2] = before + change
     push_nodes(s, cells, nodes, p_u + change * by_u, p_v + change * by_v, nodes.displacement, arity)
 

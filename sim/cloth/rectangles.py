@@ -1,10 +1,13 @@
 """Springs of rectangles on a CPU, without lists: every direction eight lines at a time."""
 
+from itertools import product
+
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import Lines
+from sim.cloth.device_cells import SHEAR_SWEEPS
 from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, load_blocks, rectangle_of, row_blocks, store_blocks, strips_of
@@ -86,7 +89,7 @@ class RectangleSprings:
                 short,
             )
         for sweep in range(sweeps):
-            for parity in range(2):
+            for time, parity in product(range(SHEAR_SWEEPS), range(2)):
                 solve_cells_in_rows(
                     blocks,
                     parity,
@@ -95,7 +98,7 @@ class RectangleSprings:
                     self._cell_stiffness,
                     state.quantum,
                     dt * dt,
-                    int(sweep == 0),
+                    int(sweep == time == 0),
                     short,
                 )
             self._solve_threads(dt, is_first=sweep == 0)

@@ -3,6 +3,7 @@
 import taichi as ti
 
 from sim.cloth.bundles import Lines, Rectangle
+from sim.cloth.device_cells import over_relaxed
 from sim.cloth.device_springs import TINY_LENGTH
 from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, two_blocks
 from sim.core.arrays import Floats
@@ -165,7 +166,8 @@ def solve_cells_in_rows(
                     acts = at < cells and at % 2 == way
                     before = ti.select(is_first, 0.0, multiplier[at])
                     error = strength * half * (longer - shorter) + before
-                    change = ti.select(acts, -error / (strength * weight + 1.0), 0.0)
+                    stiff = strength * weight
+                    change = ti.select(acts, -over_relaxed(stiff) * error / (stiff + 1.0), 0.0)
                     multiplier[at] = ti.select(acts, before + change, multiplier[at])
                     rise_x[at], rise_y[at], rise_z[at] = change * r_x, change * r_y, change * r_z
                     fall_x[at], fall_y[at], fall_z[at] = change * t_x, change * t_y, change * t_z

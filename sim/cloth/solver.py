@@ -47,10 +47,10 @@ INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 LOST_DISTANCE = 10.0
 """Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
 
-REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW = 0.05, 0.03, 0.02
+REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.03, 0.02, 0.035
 """Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; beyond
-which springs and contacts take another turn; and below which steps go back. It falls with every turn and sweep, and
-with the square of the step."""
+which springs and contacts take another turn; below which sweeps go back, and below which steps do: turns end between
+both. It falls with every turn and sweep, and with the square of the step."""
 
 LIVE_KEYS = frozenset(
     (
@@ -285,7 +285,7 @@ class ClothSolver:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
             self._refinement = min(2 * self._refinement, MOST_REFINED)
-        elif self._excess < RESTORED_BELOW and turns < 2:
+        elif self._excess < LENGTHENED_BELOW and turns < 2:
             self._refinement = max(self._refinement // 2, 1)
         if by_springs < RESTORED_BELOW:
             self._sweeps = max(self._sweeps // 2, 1)

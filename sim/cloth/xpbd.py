@@ -1,13 +1,14 @@
 """Compliant springs with small steps: XPBD with one iteration a step (Macklin et al. 2019, "Small steps")."""
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 import taichi as ti
 
 from sim.cloth.angular_momentum import AngularMomentumCorrection
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
-from sim.cloth.device_cells import DeviceCells, damp_cells, measure_cell_excess, solve_cells
+from sim.cloth.device_cells import SHEAR_SWEEPS, DeviceCells, damp_cells, measure_cell_excess, solve_cells
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
@@ -131,14 +132,15 @@ class XPBDSprings:
 
     def _sweep_lists(self, solved: Sequence[DeviceCells], dt: float, *, is_first: bool) -> None:
         for cells in solved:
-            for colour in cells.first_colours:
+            sweeps = 1 if cells.arity == TRIANGLE else SHEAR_SWEEPS
+            for time, colour in product(range(sweeps), cells.first_colours):
                 solve_cells(
                     cells.on_device,
                     cells.cell_of_colour,
                     colour,
                     self._state.nodes,
                     dt * dt,
-                    int(is_first),
+                    int(is_first and time == 0),
                     cells.multiplier,
                     cells.arity,
                 )
