@@ -30,9 +30,6 @@ MORE_ITERATIONS = 16
 """Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
 in stacks and impacts; two layers under their weight need one step."""
 
-TOLERANCE = 0.02
-"""Part of their thickness by which contacts may miss what they should keep."""
-
 REPAIRS = 4
 """Rounds in which crossing pairs are pushed before they become impact zones."""
 
@@ -123,7 +120,7 @@ class ContinuousContacts:
         )
         self._pushed.support.fill(0.0)
         self._sums = NodeSums(
-            counter=ti.ndarray(ti.i32, 3),
+            counter=ti.ndarray(ti.i32, 4),
             predicted=ti.Vector.ndarray(3, ti.f32, n),
             shares=ti.ndarray(ti.i32, n),
             held_sums=ti.ndarray(ti.i32, 6 * n),
@@ -131,7 +128,7 @@ class ContinuousContacts:
             pressing_body=ti.ndarray(ti.i32, n),
         )
         self._crossing, self._crossing_count = ti.ndarray(ti.i32, 4 * n), ti.ndarray(ti.i32, 1)
-        self._missing, self._ends = LaneReduction(maxima=1, sums=0), LaneReduction(maxima=6, sums=0)
+        self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
         self._meets_cloth, self._is_warm = False, False
@@ -277,12 +274,12 @@ class ContinuousContacts:
         """Push; first in turns with the springs, for as long as these `relax`."""
         short = self._is_short(count)
         while True:
-            pushing, touched, missing = self._begin_push(state, count, is_first=is_first, short=short)
+            pushing, touched, is_missing = self._begin_push(state, count, is_first=is_first, short=short)
             self._iterations += STEPS if pushing else 0
             if not pushing or not relax():
                 break
             is_first = False
-        if pushing and not np.int32(missing).view(np.float32) <= TOLERANCE:
+        if pushing and is_missing:
             for first in range(0, MORE_ITERATIONS, STEPS):
                 self._push_on(pushing, touched, first, short=short)
             self._iterations += MORE_ITERATIONS
@@ -300,7 +297,6 @@ class ContinuousContacts:
             self._sums,
             state.thickness,
             self.rigid.bodies.pushed,
-            self._missing.tree,
             int(is_first),
             short,
         )

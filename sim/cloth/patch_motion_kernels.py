@@ -17,7 +17,7 @@ from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import Results, Share, reduced, runs_on_gpu
+from sim.core.reductions import Share, item_of, items_of, lane_count, of_rank, rank, reduced, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
 FAR = 1.0e30
@@ -47,65 +47,103 @@ SKIN_IN_MOTIONS = 2.0
 def look_at_patches(
     vertex_count: ti.i32,
     nodes: TrackedNodes,
-    of_vertices: Share,
-    of_patches: Share,
     still: ti.f32,
     corners: PatchNodes,
     patches: PatchBounds,
     budget: PatchBudget,
-    workers: ti.i32,
+    patch_workers: ti.i32,
+    known_astray: ti.f32,
+    met: PatchPairArrays,
+    pair_workers: ti.i32,
+    thickness: ti.f32,
+    least_skin: ti.f32,
+    first_due: Floats,
+    first_due_of_edges: Floats,
+    needed: Integers,
+    counter: Integers,
     taken: Integers,
     is_short: ti.template(),
-) -> Results:
-    """Where patches are, and how they move in this substep.
+) -> ti.math.ivec4:
+    """Where patches are, and how they move in this substep; then, if the list of their pairs holds, which of these have
+    to be searched, and of which some elements are due.
 
     A rigid motion c + w x (x - centre) is fitted to the displacements of each patch, by least squares. The fit decides
-    how small the rest is, not whether it is a bound.
+    how small the rest is, not whether it is a bound. The list holds while what patches spend, with the motion of this
+    substep and what may come besides, is within their reach.
 
-    Returns the largest components of displacements [m], then those of their negatives; how far a vertex is at most from
-    where its last displacement should have led it; and how far the motion of a patch, with what was spent before
-    and may come besides, passes the reach of the list of pairs of patches at most.
+    Args:
+        vertex_count: 0 if patches have been looked at; nothing but `known_astray` is asked then.
+        nodes, corners: the vertices, and those of each patch.
+        still: see `fit_motion`.
+        patches, budget: get the motion.
+        patch_workers, pair_workers, taken: see `sim.core.scheduling`.
+        known_astray: largest distance of a vertex from where it was left [m].
+        met: the pairs; see `age_pair`.
+        thickness, least_skin, first_due, first_due_of_edges, needed: see `age_pair`.
+        counter: gets the two numbers of pairs, and whether the list does not hold.
+
+    Returns half the diagonal of the box of all displacements, and how far a vertex is at most from where its last
+    displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
+    not hold; and of how many some elements are due.
     """
-    workers_end = workers
+    vertices_end, patches_end, pairs_end = vertex_count, patch_workers, pair_workers
+    items = items_of(vertices_end)
+    counter[0], counter[1], counter[2] = 0, 0, 0
+    most_x, most_y, most_z = rank(-FAR), rank(-FAR), rank(-FAR)
+    least_x, least_y, least_z = rank(-FAR), rank(-FAR), rank(-FAR)
+    farthest = rank(0.0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(of_vertices.tree.lanes):
+    for lane in range(ti.static(lane_count())):
         most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
-        for k in range(of_vertices.items):
-            i = lane * of_vertices.lane_step + k * of_vertices.item_step
-            if i < vertex_count:
+        for k in range(items):
+            i = item_of(lane, k, items)
+            if i < vertices_end:
                 u = nodes.displacement[i]
                 most, least = ti.max(most, u), ti.min(least, u)
                 off = ti.max(off, (nodes.position[i] - nodes.expected[i]).norm_sqr())
-        for axis in ti.static(range(3)):
-            (
-                of_vertices.tree.partial[axis * of_vertices.tree.lanes + lane],
-                of_vertices.tree.partial[(3 + axis) * of_vertices.tree.lanes + lane],
-            ) = most[axis], -least[axis]
-        of_vertices.tree.partial[6 * of_vertices.tree.lanes + lane] = off
-    ends = reduced(of_vertices.tree.partial, of_vertices.tree.lanes, 7, 7, of_vertices.tree.nodes)
-    middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
-    astray = ti.sqrt(ends[6])
+        ti.atomic_max(most_x, rank(most.x))
+        ti.atomic_max(most_y, rank(most.y))
+        ti.atomic_max(most_z, rank(most.z))
+        ti.atomic_max(least_x, rank(-least.x))
+        ti.atomic_max(least_y, rank(-least.y))
+        ti.atomic_max(least_z, rank(-least.z))
+        ti.atomic_max(farthest, rank(off))
     begin_sharing(taken, 0)
-    for worker in range(workers_end):
-        lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
-        while lane < of_vertices.tree.lanes:
-            beyond = -FAR
-            for k in range(of_patches.items):
-                m = lane * of_patches.lane_step + k * of_vertices.item_step
-                if m < corners.count:
-                    fit_motion(m, still, corners, nodes, patches)
-                    budget.moves[m] = (1.0 + SAFETY) * (
-                        (patches.motion.shift[m] - middle).norm()
-                        + patches.motion.turn[m].norm() * patches.motion.radius[m]
-                        + patches.motion.rest[m]
-                    )
-                    budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
-                    beyond = ti.max(beyond, budget.travel[m] - budget.reach[m])
-            of_vertices.tree.partial[lane] = beyond
-            lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
-    worst = reduced(of_vertices.tree.partial, of_vertices.tree.lanes, 1, 1, of_vertices.tree.nodes)
-    return Results(ends[0], ends[1], ends[2], ends[3], ends[4], ends[5], astray, worst[0])
+    for worker in range(patches_end):
+        most = ti.math.vec3(of_rank(most_x), of_rank(most_y), of_rank(most_z))
+        least = -ti.math.vec3(of_rank(least_x), of_rank(least_y), of_rank(least_z))
+        middle, astray = 0.5 * (most + least), ti.sqrt(of_rank(farthest))
+        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while m < corners.count:
+            fit_motion(m, still, corners, nodes, patches)
+            budget.moves[m] = (1.0 + SAFETY) * (
+                (patches.motion.shift[m] - middle).norm()
+                + patches.motion.turn[m].norm() * patches.motion.radius[m]
+                + patches.motion.rest[m]
+            )
+            budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
+            if not budget.travel[m] <= budget.reach[m]:
+                counter[2] = 1
+            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+    begin_sharing(taken, 1)
+    for worker in range(pairs_end):
+        astray = ti.select(vertex_count > 0, ti.sqrt(of_rank(farthest)), known_astray)
+        end = ti.select(counter[2] == 0, met.count, 0)
+        p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
+        while p < end:
+            age_pair(
+                p, met, patches, budget, thickness, least_skin, astray, first_due, first_due_of_edges, needed, counter
+            )
+            p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)
+    size = ti.math.vec3(of_rank(most_x) + of_rank(least_x), of_rank(most_y) + of_rank(least_y), 0.0)
+    size.z = of_rank(most_z) + of_rank(least_z)
+    return ti.math.ivec4(
+        ti.bit_cast(0.5 * size.norm(), ti.i32),
+        ti.bit_cast(ti.sqrt(of_rank(farthest)), ti.i32),
+        ti.select(counter[2] == 0, counter[0], -1),
+        counter[1],
+    )
 
 
 @func
@@ -295,11 +333,10 @@ def approach_of(m: ti.i32, other: ti.i32, motion: PatchMotion) -> ti.f32:
     )
 
 
-@kernel
-def age_pairs(
+@func
+def age_pair(
+    p: ti.i32,
     met: PatchPairArrays,
-    workers: ti.i32,
-    taken: Integers,
     patches: PatchBounds,
     budget: PatchBudget,
     thickness: ti.f32,
@@ -309,17 +346,16 @@ def age_pairs(
     first_due_of_edges: Floats,
     needed: Integers,
     counter: Integers,
-) -> ti.math.ivec2:
-    """List the pairs of patches whose elements have to be searched before this substep, and those of whose elements
-    some are due; returns how many there are.
+):
+    """List a pair of patches if its elements have to be searched before this substep, and if some of them are due.
 
     Pairs far apart sleep until their patches' motion can have closed the gap between their boxes.
 
     Args:
+        p: number of the pair.
         met: the pairs, with `slack`: how much nearer elements that are not listed may come, and be a thickness apart;
             and `left`: what of it elements that are listed may use up until they are looked at: one that was d apart
             when the slack was s is due when `left` is below s - d.
-        workers, taken: see `sim.core.scheduling`.
         patches, budget: their motion in this substep.
         thickness: the largest [m].
         least_skin: how far beyond to search at least [m].
@@ -327,38 +363,31 @@ def age_pairs(
         first_due, first_due_of_edges: the largest number that is due of a pair of patches; `NEVER` after this where it
             is due, as those that are looked at get other ones.
         needed: gets 1 for patches of pairs that are searched.
-        counter: two integers to count with.
+        counter: of both lists.
     """
-    counter[0], counter[1] = 0, 0
-    begin_sharing(taken, 0)
-    for worker in range(workers):
-        p = next_item(-1, worker, taken, 0, PAIRS_AT_A_TIME)
-        while p < met.count:
-            m, other = met.pairs[p][0], met.pairs[p][1]
-            if budget.travel[m] + budget.travel[other] > met.wake[p]:
-                whole, besides = budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other]
-                nearer = ti.min(approach_of(m, other, patches.motion), whole)
-                met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
-                met.slack[p] -= 2.0 * astray
-                is_searched = False
-                if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
-                    gap = gap_of_boxes(m, other, patches.low, patches.high) - (1.0 + SAFETY_OF_DUE) * thickness
-                    if gap > whole + besides:
-                        met.wake[p], met.slack[p] = budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0
-                        met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
-                    else:
-                        skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
-                        met.wake[p], met.slack[p], met.reach[p] = -1.0, skin, thickness + skin
-                        is_searched = True
-                        met.expired[ti.atomic_add(counter[0], 1)] = p
-                        needed[m], needed[other] = 1, 1
-                if met.wake[p] < 0.0:
-                    met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
-                    if is_searched or first_due[p] >= met.left[p] or first_due_of_edges[p] >= met.left[p]:
-                        met.due[ti.atomic_add(counter[1], 1)] = p
-                        first_due[p], first_due_of_edges[p] = NEVER, NEVER
-            p = next_item(p, worker, taken, 0, PAIRS_AT_A_TIME)
-    return ti.math.ivec2(counter[0], counter[1])
+    m, other = met.pairs[p][0], met.pairs[p][1]
+    if budget.travel[m] + budget.travel[other] > met.wake[p]:
+        whole, besides = budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other]
+        nearer = ti.min(approach_of(m, other, patches.motion), whole)
+        met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
+        met.slack[p] -= 2.0 * astray
+        is_searched = False
+        if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
+            gap = gap_of_boxes(m, other, patches.low, patches.high) - (1.0 + SAFETY_OF_DUE) * thickness
+            if gap > whole + besides:
+                met.wake[p], met.slack[p] = budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0
+                met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
+            else:
+                skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
+                met.wake[p], met.slack[p], met.reach[p] = -1.0, skin, thickness + skin
+                is_searched = True
+                met.expired[ti.atomic_add(counter[0], 1)] = p
+                needed[m], needed[other] = 1, 1
+        if met.wake[p] < 0.0:
+            met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
+            if is_searched or first_due[p] >= met.left[p] or first_due_of_edges[p] >= met.left[p]:
+                met.due[ti.atomic_add(counter[1], 1)] = p
+                first_due[p], first_due_of_edges[p] = NEVER, NEVER
 
 
 @kernel

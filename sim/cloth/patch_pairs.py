@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
 from sim.cloth.bundles import (
     BoxTree,
@@ -22,7 +21,6 @@ from sim.cloth.bundles import (
 )
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_motion_kernels import (
-    age_pairs,
     finish_patches,
     look_at_patches,
     measure_changes,
@@ -33,7 +31,7 @@ from sim.cloth.patch_motion_kernels import (
 )
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces
-from sim.core.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
+from sim.core.reductions import LaneReduction, runs_on_gpu
 from sim.core.scheduling import is_short, workers_for
 
 if TYPE_CHECKING:
@@ -196,13 +194,13 @@ class PatchPairs:
         self._budget = PatchBudget(*(ti.ndarray(ti.f32, m) for _ in PatchBudget._fields))
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree = BoxTree(patches.leaves, *(ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2)))
-        self._counter, self._taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 2)
+        self._counter, self._taken = ti.ndarray(ti.i32, 3), ti.ndarray(ti.i32, 2)
         self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
         self.needed.fill(0)
-        self._maxima = LaneReduction(maxima=MAX_QUANTITIES, sums=0)
+        self._maxima = LaneReduction(maxima=2, sums=0)
         self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
-        self.count = self.due_count = 0
+        self.count = self.due_count = self.expired_count = 0
         self._is_short = is_short(patches.vertex_count, NODE_NS)
         self._allocate(8 * m)
 
@@ -240,27 +238,17 @@ class PatchPairs:
         self._budget.margin.fill(MARGIN * thickness)
         self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
-    def look(self, state: ClothState) -> tuple[NDArray[np.float64], bool]:
+    def look(self, state: ClothState, *age: float | ti.Ndarray) -> tuple[float, bool]:
         """Note where patches are and how they move in this substep.
 
-        Returns the largest components of the displacements [m], then those of their negatives, (6,); and whether the
-        pairs of patches hold for this substep, if they held before.
+        Returns how far vertices get apart from their common motion [m]; and whether the pairs of patches hold for this
+        substep, if they held before. If they are to be aged then, they have been.
+
+        Args:
+            state: at the start of the substep.
+            age: as `age` takes them, if the pairs held before.
         """
-        patches, n = self.patches, self.patches.vertex_count
-        *ends, self._astray, beyond = look_at_patches(
-            n,
-            self._tracked(state),
-            self._maxima.over(n),
-            self._maxima.over(patches.count),
-            self._still,
-            patches.corner_lists,
-            self.bounds,
-            self._budget,
-            workers_for(self._maxima.lanes.count),
-            self._taken,
-            self._is_short,
-        )
-        return np.array(ends, dtype=np.float64), beyond <= 0.0
+        return self._look(state, self.patches.vertex_count, *age)
 
     def meet(self, thickness: float, edge: float, collides: ti.Ndarray, *, keeps: bool = False) -> bool:
         """List the pairs of patches that may get within a thickness [m].
@@ -318,29 +306,42 @@ class PatchPairs:
         self.count = int(found)
         return keeps
 
-    def age(self, thickness: float, least_skin: float, *first_due: ti.Ndarray) -> int:
+    def age(self, state: ClothState, thickness: float, least_skin: float, *first_due: ti.Ndarray) -> int:
         """Find which pairs have to be searched in this substep, and how far each; returns how many there are.
 
         Args:
+            state: at the start of the substep.
             thickness: distance within which all elements have to be listed [m].
             least_skin: how far beyond to search at least [m].
             first_due: `PairList.piece_due` of both lists; `NEVER` after this where a pair is due.
         """
-        expired, due = age_pairs(
-            self.on_device,
-            workers_for(self.count),
-            self._taken,
+        self._look(state, 0, thickness, least_skin, *first_due)
+        return self.expired_count
+
+    def _look(self, state: ClothState, vertex_count: int, *age: float | ti.Ndarray) -> tuple[float, bool]:
+        """Look at the patches unless there are no vertices, then age the pairs unless nothing is said about that."""
+        patches = self.patches
+        motion, astray, expired, due = look_at_patches(
+            vertex_count,
+            self._tracked(state),
+            self._still,
+            patches.corner_lists,
             self.bounds,
             self._budget,
-            thickness,
-            least_skin,
+            workers_for(patches.count) if vertex_count else 0,
             self._astray,
-            *first_due,
+            self.on_device,
+            workers_for(self.count) if age else 0,
+            *(age or (0.0, 0.0, self.left, self.left)),
             self.needed,
             self._counter,
-        )[:2]
-        self.due_count = int(due)
-        return int(expired)
+            self._taken,
+            self._is_short,
+        )
+        if vertex_count:
+            self._astray = float(np.int32(astray).view(np.float32))
+        self.expired_count, self.due_count = max(int(expired), 0), int(due)
+        return float(np.int32(motion).view(np.float32)), expired >= 0
 
     def measure_changes(self, state: ClothState, predicted: ti.Ndarray) -> tuple[float, float]:
         """How far contacts displaced vertices at most [m]; and those that they displaced farther than allowed for.

@@ -99,9 +99,16 @@ class SelfCollision:
 
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
-        ends, holds = self._met.look(state)
+        motion, holds = self._met.look(state, *(() if self._is_forgotten or self._is_outrun else self._age))
         self._is_outrun |= not holds
-        return float(0.5 * np.linalg.norm(ends[:3] + ends[3:]))
+        return motion
+
+    @property
+    def _age(self) -> tuple[float, float, ti.Ndarray, ti.Ndarray]:
+        """As `PatchPairs.age` takes it."""
+        edge = self.mean_edge
+        least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
+        return self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due
 
     def warm_up(self) -> None:
         """Compile what carries lists over."""
@@ -113,19 +120,18 @@ class SelfCollision:
         After `look`. Pairs that are not listed come no nearer than a thickness without contacts, and do not meet where
         these displace vertices within their margins.
         """
-        met, edge = self._met, self.mean_edge
+        met = self._met
         if self._is_forgotten or self._is_outrun:
-            keeps = met.meet(self.thickness, edge, self._collides, keeps=not self._is_forgotten)
+            keeps = met.meet(self.thickness, self.mean_edge, self._collides, keeps=not self._is_forgotten)
             for pairs in (self.with_triangles, self.of_edges):
                 if keeps:
                     pairs.carry(met.count, met.carried, met.capacity)
                 else:
                     pairs.set_pieces(met.capacity)
             self._is_forgotten = self._is_outrun = False
-        least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        count = met.age(self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due)
-        if count:
-            self._search(state, count)
+            met.age(state, *self._age)
+        if met.expired_count:
+            self._search(state, met.expired_count)
 
     def follow(self, state: ClothState, *, is_changed: bool) -> None:
         """A substep is over.

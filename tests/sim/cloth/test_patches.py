@@ -76,7 +76,7 @@ def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     collides.fill(1)
     met.meet(1.0, 1.0, collides)
     # All are searched: none are so far apart that they might sleep.
-    assert met.age(1.0, 0.0, *nothing_due(met)) == met.count
+    assert met.age(state, 1.0, 0.0, *nothing_due(met)) == met.count
     assert met.count == patches.count * (patches.count + 1) // 2
     corners = pieces(patches.corners, patches.first_corner)
     return met.approach.to_numpy()[: met.count], met.pairs.to_numpy()[: met.count], corners
