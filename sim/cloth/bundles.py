@@ -276,17 +276,6 @@ class PatchPairArrays(NamedTuple):
     expired: Integers
 
 
-@bundle
-class Searches(NamedTuple):
-    """Numbers of the pairs of patches that are searched, for vertices near triangles and for edges."""
-
-    count: ti.i32
-    numbers: Integers
-    edge_count: ti.i32
-    edge_numbers: Integers
-    lanes: ti.i32  # threads that share a pair
-
-
 # --- pairs of elements ----------------------------------------------------------------------------------------------
 
 
@@ -299,15 +288,6 @@ class PairPieces(NamedTuple):
     pairs: Quadruples
     wanted: Floats  # [m]
     due: Floats  # [m]
-
-
-@bundle
-class PieceRoom(NamedTuple):
-    """Pieces of a list that may have to become longer."""
-
-    pieces: Quadruples  # (p,)
-    end: Integers  # of the list; how many pieces are searched again
-    again: Integers  # their numbers
 
 
 @bundle
@@ -352,7 +332,7 @@ class Contacts(NamedTuple):
     kind: Integers
     arm: Vectors  # [m]
     friction: Floats  # [-]
-    counter: Integers  # (1,)
+    counter: Integers  # (3,)
     capacity: ti.i32
 
 

@@ -17,7 +17,7 @@ from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import Share, item_of, items_of, lane_count, of_rank, rank, reduced, runs_on_gpu
+from sim.core.reductions import is_finite, item_of, items_of, lane_count, of_rank, rank, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
 FAR = 1.0e30
@@ -33,8 +33,8 @@ has met unseen. What positions do besides their displacements, as they are round
 REGULARIZATION = 1.0e-5
 """Part of the inertia of a patch that is added to it, so that it has an inverse."""
 
-PATCHES_AT_A_TIME, PAIRS_AT_A_TIME, LANES_AT_A_TIME = 16, 256, 4
-"""Patches, pairs of them, and lanes of a reduction over them that a thread takes at a time."""
+PATCHES_AT_A_TIME, PAIRS_AT_A_TIME = 16, 256
+"""Patches, and pairs of them, that a thread takes at a time."""
 
 WIDENED = 1.25
 """Contacts may push so many times as far as in the substep before without patches being looked at anew."""
@@ -390,11 +390,9 @@ def age_pair(
                 first_due[p], first_due_of_edges[p] = NEVER, NEVER
 
 
-@kernel
-def measure_changes(
-    share: Share,
-    workers: ti.i32,
-    taken: Integers,
+@func
+def measure_change(
+    m: ti.i32,
     corners: PatchNodes,
     displacement: Vectors,
     predicted: Vectors,
@@ -402,87 +400,50 @@ def measure_changes(
     change: Floats,
     margin: Floats,
     more: Floats,
-    is_short: ti.template(),
-) -> ti.math.vec2:
-    """How far contacts displaced the vertices of each patch, `change` [m]; where that is beyond the `margin` that was
-    allowed for, half as much again is from now on.
-
-    Returns the largest change, and the largest that is beyond its margin, or 0.
-    """
-    begin_sharing(taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for worker in range(workers):
-        lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
-        while lane < share.tree.lanes:
-            largest, largest_beyond = 0.0, 0.0
-            for k in range(share.items):
-                m = lane * share.lane_step + k * share.item_step
-                if m < corners.count:
-                    squared = 0.0
-                    for place in range(corners.first[m], corners.first[m + 1]):
-                        i = corners.nodes[place]
-                        squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
-                    change[m] = ti.sqrt(squared)
-                    largest = ti.max(largest, change[m])
-                    if change[m] > margin[m]:
-                        largest_beyond = ti.max(largest_beyond, change[m])
-                        margin[m] = 1.5 * change[m]
-                        more[m] = margin[m] - half_thickness
-            share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, largest_beyond
-            lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
-    results = reduced(share.tree.partial, share.tree.lanes, 2, 2, share.tree.nodes)
-    return ti.math.vec2(results[0], results[1])
-
-
-@kernel
-def finish_patches(
-    vertex_count: ti.i32,
-    nodes: TrackedNodes,
-    corners: PatchNodes,
-    patches: PatchBounds,
-    budget: PatchBudget,
-    end: SubstepEnd,
-    patch_workers: ti.i32,
-    pair_workers: ti.i32,
-    taken: Integers,
-    met: PatchPairArrays,
-    is_short: ti.template(),
+    counter: Integers,
 ):
-    """The displacements of a substep are final: note where they lead, and what of the lists they use up.
+    """How far contacts displaced the vertices of a patch at most, `change` [m]; where that is beyond the `margin` that
+    was allowed for, half as much again is from now on.
 
-    Patches that contacts changed by more than `negligible` [m] are fitted anew. Margins for the next substep are
-    `WIDENED` times what contacts did in this one, and `least_margin` at least [m].
+    The second number of `counter` becomes 1 where it is beyond, and the third where it is not finite.
     """
-    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    vertices_end, patches_end, pairs_end = vertex_count, corners.count, met.count
-    first_end, second_end = patch_workers, pair_workers
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for i in range(vertices_end):
-        nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
-    begin_sharing(taken, 0)
-    for worker in range(first_end):
-        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while m < patches_end:
-            budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
-            budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
-            budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m])
-            budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
-            if budget.change[m] > end.negligible:
-                fit_motion(m, end.still, corners, nodes, patches)
-            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
-    begin_sharing(taken, 1)
-    for worker in range(second_end):
-        p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
-        while p < pairs_end:
-            if met.slack[p] > 0.0:
-                m, other = met.pairs[p][0], met.pairs[p][1]
-                nearer = met.approach[p] + budget.change[m] + budget.change[other]
-                if ti.max(budget.change[m], budget.change[other]) > end.negligible:
-                    nearer = approach_of(m, other, patches.motion)
-                    # A patch that was not fitted anew moves as noted, but for its change.
-                    nearer += ti.select(budget.change[m] > end.negligible, 0.0, budget.change[m])
-                    nearer += ti.select(budget.change[other] > end.negligible, 0.0, budget.change[other])
-                met.slack[p] -= nearer
-            p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)
+    squared = 0.0
+    for place in range(corners.first[m], corners.first[m + 1]):
+        i = corners.nodes[place]
+        squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
+    change[m] = ti.sqrt(squared)
+    if change[m] > margin[m]:
+        margin[m] = 1.5 * change[m]
+        more[m] = margin[m] - half_thickness
+        counter[1] = 1
+    if is_finite(squared) == 0:
+        counter[2] = 1
+
+
+@func
+def finish_patch(
+    m: ti.i32, nodes: TrackedNodes, corners: PatchNodes, patches: PatchBounds, budget: PatchBudget, end: SubstepEnd
+):
+    """What a patch used up of the lists in a substep. If contacts changed it by more than `negligible` [m] it is fitted
+    anew; its margin for the next substep is `WIDENED` times what they did in this one, and `least_margin` [m] at least.
+    """
+    budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
+    budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
+    budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m])
+    budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
+    if budget.change[m] > end.negligible:
+        fit_motion(m, end.still, corners, nodes, patches)
+
+
+@func
+def finish_pair(p: ti.i32, met: PatchPairArrays, patches: PatchBounds, budget: PatchBudget, negligible: ti.f32):
+    """The same of a pair of patches."""
+    if met.slack[p] > 0.0:
+        m, other = met.pairs[p][0], met.pairs[p][1]
+        nearer = met.approach[p] + budget.change[m] + budget.change[other]
+        if ti.max(budget.change[m], budget.change[other]) > negligible:
+            nearer = approach_of(m, other, patches.motion)
+            # A patch that was not fitted anew moves as noted, but for its change.
+            nearer += ti.select(budget.change[m] > negligible, 0.0, budget.change[m])
+            nearer += ti.select(budget.change[other] > negligible, 0.0, budget.change[other])
+        met.slack[p] -= nearer
