@@ -120,16 +120,6 @@ class Air(NamedTuple):
     impulse: Vectors  # [N s], (k,)
 
 
-@bundle
-class AirAtNodes(NamedTuple):
-    """Forces of the air as nodes gather them."""
-
-    force: Vectors  # on each triangle [N], (k,)
-    share: Floats  # [-], (n,)
-    triangle_start: Integers  # of each node in the list, (n + 1,)
-    triangle_list: Integers  # (3 k,)
-
-
 # --- rows of rectangles ---------------------------------------------------------------------------------------------
 
 

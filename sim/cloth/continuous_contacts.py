@@ -20,7 +20,6 @@ from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.core.host_access import copied
-from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short
 
 if TYPE_CHECKING:
@@ -128,7 +127,6 @@ class ContinuousContacts:
             lever=ti.ndarray(ti.f32, n),
             pressing_body=ti.ndarray(ti.i32, n),
         )
-        self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
         self._meets_cloth, self._is_warm = False, False
@@ -140,16 +138,17 @@ class ContinuousContacts:
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
         n, first = state.vertex_count, state.host.first_node
-        velocity = self._box(state.velocity, 0, n)
+        velocity = box_of(state.velocity, 0, n)
         shortest = self.rigid.stable_dt(
             *velocity,
-            lambda: self._box(state.position, 0, n),
+            lambda: box_of(state.position, 0, n),
             at_most=self._little_motion(velocity, at_most) if self._meets_cloth else at_most,
         )
         if shortest == at_most or len(state.names) == 1:
             return shortest
         velocities, places = (
-            [self._box(vectors, *ends) for ends in pairwise(first)] for vectors in (state.velocity, state.position)
+            [box_of(vectors, *ends) for ends in pairwise(first.tolist())]
+            for vectors in (state.velocity, state.position)
         )
         shortest = at_most
         for number, (velocity, place) in enumerate(zip(velocities, places, strict=True)):
@@ -166,9 +165,6 @@ class ContinuousContacts:
             together = self._little_motion((velocities[a][0], 0.5 * closing), shortest)
             shortest = min(shortest, max(together, from_far))
         return shortest
-
-    def _box(self, vectors: ti.Ndarray, first: int, end: int) -> Box:
-        return box_of(vectors, int(first), int(end), self._ends)
 
     def _little_motion(self, velocity: Box, at_most: float) -> float:
         """Largest step [s] in which cloth with such a box of velocities [m/s] moves little against itself."""

@@ -18,7 +18,7 @@ do not leave or enter either whatever their mass. But the cloth's own springs pu
 than its friction would let them.
 
 Sums over contacts are sums of integers, in units far below anything that matters: the same for any order of contacts
-and threads.
+and threads. Loops over bodies are serial on a CPU: a few bodies are done sooner than other threads wake.
 """
 
 import taichi as ti
@@ -29,6 +29,7 @@ from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, WALL
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
+from sim.core.reductions import runs_on_gpu
 
 SHARES_PER_UNIT = 65536.0
 """Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
@@ -308,7 +309,8 @@ def push_apart(
     displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, touched_end, moved_end = count, touched_count, touched_count + bodies.count
+    contacts_end, touched_end, bodies_end = count, touched_count, bodies.count
+    moved_end = touched_count + bodies.count * ti.static(int(runs_on_gpu()))
     new_end = starts * ti.max(count, touched_count, bodies.count)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -330,11 +332,10 @@ def push_apart(
         for step in range(STEPS):
             for place in range(contacts_end):
                 push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
-            for place in range(moved_end):
-                if place < touched_end:
-                    move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
-                else:
-                    move_body(place - touched_end, momenta[step + 1], impulses, bodies)
+            for place in range(touched_end):
+                move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
+            for b in range(bodies_end):
+                move_body(b, momenta[step + 1], impulses, bodies)
     else:
         for step in ti.static(range(STEPS)):
             for place in range(contacts_end):
@@ -342,8 +343,12 @@ def push_apart(
             for place in range(moved_end):
                 if place < touched_end:
                     move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
-                else:
+                elif ti.static(runs_on_gpu()):
                     move_body(place - touched_end, momenta[step + 1], impulses, bodies)
+            if ti.static(not runs_on_gpu()):
+                ti.loop_config(serialize=True)
+                for b in range(bodies_end):
+                    move_body(b, momenta[step + 1], impulses, bodies)
 
 
 @func
@@ -409,8 +414,7 @@ def finish_push(
     Nothing where it does not finish yet: a kernel with it and one without would be compiled, for seconds each.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, touched_end = finishes * count, finishes * touched_count
-    moved_end = finishes * (touched_count + bodies.count)
+    contacts_end, touched_end, bodies_end = finishes * count, finishes * touched_count, finishes * bodies.count
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for place in range(contacts_end):
@@ -420,20 +424,20 @@ def finish_push(
             give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for place in range(moved_end):
-        if place < touched_end:
-            i = nodes.touched[place]
-            given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
-            nodes.displacement[i] = nodes.start[i] + (nodes.inverse_mass[i] * impulses.unit) * given
-        else:
-            b = place - touched_end
-            for axis in ti.static(range(6)):
-                bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
-            bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(
-                bodies.gathered, 6 * b
-            )
-            twist = impulses.unit * take(bodies.gathered, 6 * b + 3)
-            bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
+    for place in range(touched_end):
+        i = nodes.touched[place]
+        given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
+        nodes.displacement[i] = nodes.start[i] + (nodes.inverse_mass[i] * impulses.unit) * given
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for b in range(bodies_end):
+        for axis in ti.static(range(6)):
+            bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
+        bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(
+            bodies.gathered, 6 * b
+        )
+        twist = impulses.unit * take(bodies.gathered, 6 * b + 3)
+        bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
 
 
 @kernel
