@@ -20,6 +20,7 @@ from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.core.host_access import copied
+from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short
 
 if TYPE_CHECKING:
@@ -127,6 +128,7 @@ class ContinuousContacts:
             lever=ti.ndarray(ti.f32, n),
             pressing_body=ti.ndarray(ti.i32, n),
         )
+        self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
         self._meets_cloth, self._is_warm = False, False
@@ -138,16 +140,16 @@ class ContinuousContacts:
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
         n, first = state.vertex_count, state.host.first_node
-        velocity = box_of(state.velocity, 0, n)
+        velocity = box_of(state.velocity, 0, n, self._ends)
         shortest = self.rigid.stable_dt(
             *velocity,
-            lambda: box_of(state.position, 0, n),
+            lambda: box_of(state.position, 0, n, self._ends),
             at_most=self._little_motion(velocity, at_most) if self._meets_cloth else at_most,
         )
         if shortest == at_most or len(state.names) == 1:
             return shortest
         velocities, places = (
-            [box_of(vectors, *ends) for ends in pairwise(first.tolist())]
+            [box_of(vectors, *ends, self._ends) for ends in pairwise(first.tolist())]
             for vectors in (state.velocity, state.position)
         )
         shortest = at_most

@@ -14,7 +14,7 @@ from sim.cloth.state import ClothState
 from sim.core.arrays import Vectors
 from sim.core.host_access import copied
 from sim.core.launch import kernel
-from sim.core.reductions import item_of, items_of, lane_count, of_rank, rank
+from sim.core.reductions import LaneReduction, Share, reduced
 from sim.core.scheduling import is_short, workers_for
 
 
@@ -44,6 +44,7 @@ class LoneCloth:
         self._change, self._margin = floats(), floats()
         self._more = floats()  # `measure_change` writes it, for pairs of patches; nothing reads it here
         self._taken, self._counter = ti.ndarray(ti.i32, 1), ti.ndarray(ti.i32, 3)
+        self._maxima = LaneReduction(maxima=1, sums=0)
         self._is_short = is_short(patches.vertex_count, NODE_NS)
         self.begin_frame(state)
 
@@ -57,7 +58,14 @@ class LoneCloth:
         """Note where patches are and how they move in this substep; returns the largest displacement [m], or more."""
         patches = self._patches
         return float(
-            bound_patches(patches.corner_lists, state.position, state.displacement, self.motion, self._is_short)
+            bound_patches(
+                self._maxima.over(patches.count),
+                patches.corner_lists,
+                state.position,
+                state.displacement,
+                self.motion,
+                self._is_short,
+            )
         )
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
@@ -99,17 +107,20 @@ class LoneCloth:
 
 @kernel
 def bound_patches(
-    corners: PatchNodes, position: Vectors, displacement: Vectors, patches: PatchMotion, is_short: ti.template()
+    share: Share,
+    corners: PatchNodes,
+    position: Vectors,
+    displacement: Vectors,
+    patches: PatchMotion,
+    is_short: ti.template(),
 ) -> ti.f32:
     """A sphere around each patch, and one around the displacements of its corners; the longest of these, or more."""
-    items = items_of(corners.count)
-    highest = rank(0.0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(ti.static(lane_count())):
+    for lane in range(share.tree.lanes):
         longest = 0.0
-        for k in range(items):
-            m = item_of(lane, k, items)
+        for k in range(share.items):
+            m = lane * share.lane_step + k * share.item_step
             if m < corners.count:
                 i = corners.nodes[corners.first[m]]
                 least, most, u_least, u_most = position[i], position[i], displacement[i], displacement[i]
@@ -120,5 +131,5 @@ def bound_patches(
                 patches.centre[m], patches.radius[m] = 0.5 * (least + most), 0.5 * (most - least).norm()
                 patches.shift[m], patches.rest[m] = 0.5 * (u_least + u_most), 0.5 * (u_most - u_least).norm()
                 longest = ti.max(longest, patches.shift[m].norm() + patches.rest[m])
-        ti.atomic_max(highest, rank(longest))
-    return of_rank(highest)
+        share.tree.partial[lane] = longest
+    return reduced(share.tree.partial, share.tree.lanes, 1, 1, share.tree.nodes)[0]

@@ -17,7 +17,7 @@ from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import is_finite, item_of, items_of, lane_count, of_rank, rank, runs_on_gpu
+from sim.core.reductions import Share, is_finite, reduced_tree, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
 FAR = 1.0e30
@@ -47,6 +47,7 @@ SKIN_IN_MOTIONS = 2.0
 def look_at_patches(
     vertex_count: ti.i32,
     nodes: TrackedNodes,
+    of_vertices: Share,
     still: ti.f32,
     corners: PatchNodes,
     patches: PatchBounds,
@@ -73,7 +74,7 @@ def look_at_patches(
 
     Args:
         vertex_count: 0 if patches have been looked at; nothing but `known_astray` is asked then.
-        nodes, corners: the vertices, and those of each patch.
+        nodes, of_vertices, corners: the vertices, how lanes share them, and those of each patch.
         still: see `fit_motion`.
         patches, budget: get the motion.
         patch_workers, pair_workers, taken: see `sim.core.scheduling`.
@@ -86,34 +87,30 @@ def look_at_patches(
     displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
     not hold; and of how many some elements are due.
     """
-    vertices_end, patches_end, pairs_end = vertex_count, patch_workers, pair_workers
-    items = items_of(vertices_end)
+    patches_end, pairs_end = patch_workers, pair_workers
     counter[0], counter[1], counter[2] = 0, 0, 0
-    most_x, most_y, most_z = rank(-FAR), rank(-FAR), rank(-FAR)
-    least_x, least_y, least_z = rank(-FAR), rank(-FAR), rank(-FAR)
-    farthest = rank(0.0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(ti.static(lane_count())):
+    for lane in range(of_vertices.tree.lanes):
         most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
-        for k in range(items):
-            i = item_of(lane, k, items)
-            if i < vertices_end:
+        for k in range(of_vertices.items):
+            i = lane * of_vertices.lane_step + k * of_vertices.item_step
+            if i < vertex_count:
                 u = nodes.displacement[i]
                 most, least = ti.max(most, u), ti.min(least, u)
                 off = ti.max(off, (nodes.position[i] - nodes.expected[i]).norm_sqr())
-        ti.atomic_max(most_x, rank(most.x))
-        ti.atomic_max(most_y, rank(most.y))
-        ti.atomic_max(most_z, rank(most.z))
-        ti.atomic_max(least_x, rank(-least.x))
-        ti.atomic_max(least_y, rank(-least.y))
-        ti.atomic_max(least_z, rank(-least.z))
-        ti.atomic_max(farthest, rank(off))
+        for axis in ti.static(range(3)):
+            (
+                of_vertices.tree.partial[axis * of_vertices.tree.lanes + lane],
+                of_vertices.tree.partial[(3 + axis) * of_vertices.tree.lanes + lane],
+            ) = most[axis], -least[axis]
+        of_vertices.tree.partial[6 * of_vertices.tree.lanes + lane] = off
+    ends = reduced_tree(of_vertices.tree)
+    middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
+    size = ti.math.vec3(ends[0] + ends[3], ends[1] + ends[4], ends[2] + ends[5])
+    astray = ti.select(vertex_count > 0, ti.sqrt(ends[6]), known_astray)
     begin_sharing(taken, 0)
     for worker in range(patches_end):
-        most = ti.math.vec3(of_rank(most_x), of_rank(most_y), of_rank(most_z))
-        least = -ti.math.vec3(of_rank(least_x), of_rank(least_y), of_rank(least_z))
-        middle, astray = 0.5 * (most + least), ti.sqrt(of_rank(farthest))
         m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while m < corners.count:
             fit_motion(m, still, corners, nodes, patches)
@@ -128,7 +125,6 @@ def look_at_patches(
             m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
     begin_sharing(taken, 1)
     for worker in range(pairs_end):
-        astray = ti.select(vertex_count > 0, ti.sqrt(of_rank(farthest)), known_astray)
         end = ti.select(counter[2] == 0, met.count, 0)
         p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
         while p < end:
@@ -136,14 +132,8 @@ def look_at_patches(
                 p, met, patches, budget, thickness, least_skin, astray, first_due, first_due_of_edges, needed, counter
             )
             p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)
-    size = ti.math.vec3(of_rank(most_x) + of_rank(least_x), of_rank(most_y) + of_rank(least_y), 0.0)
-    size.z = of_rank(most_z) + of_rank(least_z)
-    return ti.math.ivec4(
-        ti.bit_cast(0.5 * size.norm(), ti.i32),
-        ti.bit_cast(ti.sqrt(of_rank(farthest)), ti.i32),
-        ti.select(counter[2] == 0, counter[0], -1),
-        counter[1],
-    )
+    expired = ti.select(counter[2] == 0, counter[0], -1)
+    return ti.math.ivec4(ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, counter[1])
 
 
 @func

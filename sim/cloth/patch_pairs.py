@@ -29,6 +29,7 @@ from sim.cloth.patch_motion_kernels import (
 )
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import NEVER, carry_pieces
+from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
 
 if TYPE_CHECKING:
@@ -198,6 +199,7 @@ class PatchPairs:
         self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
         self.needed.fill(0)
+        self._maxima = LaneReduction(maxima=7, sums=0)
         self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
         self.count = self.due_count = self.expired_count = 0
         self._is_short = is_short(patches.vertex_count, NODE_NS)
@@ -323,6 +325,7 @@ class PatchPairs:
         motion, astray, expired, due = look_at_patches(
             vertex_count,
             self._tracked(state),
+            self._maxima.over(vertex_count),
             self._still,
             patches.corner_lists,
             self.bounds,

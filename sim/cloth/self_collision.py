@@ -18,6 +18,7 @@ from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision_kernels import lanes_of_pair, range_of_vectors
 from sim.core.host_access import copied
+from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
 
 if TYPE_CHECKING:
@@ -202,13 +203,15 @@ class SelfCollision:
         return self._met
 
 
-def box_of(vectors: ti.Ndarray, first: int, end: int) -> Box:
+def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Box:
     """Middle and half edges of the box around vectors, (3,) each, the same whatever their order.
 
     Args:
         vectors: of which those from `first` up to `end` are looked at, at least one.
         first, end: numbers.
+        ends_of: of six maxima.
     """
     count = end - first
-    ends = np.array(range_of_vectors(vectors, first, count, is_short(count, NODE_NS)))
+    numbers = range_of_vectors(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
+    ends = ends_of.unpack(numbers).astype(np.float64)
     return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])

@@ -19,7 +19,7 @@ from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, l
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import LOWEST_RANK, item_of, items_of, lane_count, of_rank, rank, runs_on_gpu
+from sim.core.reductions import Results, Share, reduced, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
 OF_REST_DISTANCE = 0.7
@@ -63,9 +63,6 @@ NEVER = -1.0e30
 SAFETY_OF_DUE = 1.0e-3
 """Part of the thickness by which pairs are listed, and looked at, earlier than they could have come near: a thousand
 times what sums of float32 lose, so that what is found does not depend on when lists were made."""
-
-
-Range = ti.types.vector(6, ti.f32)
 
 
 @ti.func
@@ -344,31 +341,19 @@ def look_at_pair(
 
 
 @kernel
-def range_of_vectors(vectors: Vectors, first: ti.i32, count: ti.i32, is_short: ti.template()) -> Range:
-    """Largest components of some vectors, then those of the negative ones."""
-    items = items_of(count)
-    most_x, most_y, most_z, least_x, least_y, least_z = (
-        LOWEST_RANK,
-        LOWEST_RANK,
-        LOWEST_RANK,
-        LOWEST_RANK,
-        LOWEST_RANK,
-        LOWEST_RANK,
-    )
+def range_of_vectors(vectors: Vectors, first: ti.i32, count: ti.i32, share: Share, is_short: ti.template()) -> Results:
+    """Largest components of some vectors, then those of the negative ones, six maxima."""
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(ti.static(lane_count())):
+    for lane in range(share.tree.lanes):
         most, least = ti.math.vec3(-FAR), ti.math.vec3(FAR)
-        for k in range(items):
-            i = item_of(lane, k, items)
+        for k in range(share.items):
+            i = lane * share.lane_step + k * share.item_step
             if i < count:
                 most, least = ti.max(most, vectors[first + i]), ti.min(least, vectors[first + i])
-        ti.atomic_max(most_x, rank(most.x))
-        ti.atomic_max(most_y, rank(most.y))
-        ti.atomic_max(most_z, rank(most.z))
-        ti.atomic_max(least_x, rank(-least.x))
-        ti.atomic_max(least_y, rank(-least.y))
-        ti.atomic_max(least_z, rank(-least.z))
-    return Range(
-        of_rank(most_x), of_rank(most_y), of_rank(most_z), of_rank(least_x), of_rank(least_y), of_rank(least_z)
-    )
+        for axis in ti.static(range(3)):
+            (
+                share.tree.partial[axis * share.tree.lanes + lane],
+                share.tree.partial[(3 + axis) * share.tree.lanes + lane],
+            ) = most[axis], -least[axis]
+    return reduced(share.tree.partial, share.tree.lanes, share.tree.quantities, share.tree.maxima, share.tree.nodes)

@@ -12,7 +12,7 @@ from sim.cloth.row_blocks import LANES, Blocks
 from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import item_of, items_of, lane_count, of_rank, rank, runs_on_gpu
+from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -40,17 +40,15 @@ def excess_of(
 
 @kernel
 def measure_excess(
-    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32
-) -> ti.math.vec2:
+    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, share: Share
+) -> Results:
     """Largest excess of springs of threads in lists, and how many have not converged."""
-    items = items_of(count)
-    highest, unconverged = rank(0.0), 0
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    for lane in range(ti.static(lane_count())):
-        largest, beyond = 0.0, 0
-        for k in range(items):
-            s = item_of(lane, k, items)
+    for lane in range(share.tree.lanes):
+        largest, unconverged = 0.0, 0.0
+        for k in range(share.items):
+            s = lane * share.lane_step + k * share.item_step
             if s < count:
                 i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
                 excess = excess_of(
@@ -58,10 +56,9 @@ def measure_excess(
                 )
                 largest = ti.max(largest, excess)
                 if excess > LARGEST_RESIDUAL:
-                    beyond += 1
-        ti.atomic_max(highest, rank(largest))
-        ti.atomic_add(unconverged, beyond)
-    return ti.math.vec2(of_rank(highest), ti.cast(unconverged, ti.f32))
+                    unconverged += 1.0
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
+    return reduced_tree(share.tree)
 
 
 @kernel

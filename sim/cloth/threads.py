@@ -9,7 +9,7 @@ from sim.cloth.spring_convergence import measure_excess
 from sim.cloth.state import ClothState
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import runs_on_gpu
+from sim.core.reductions import LaneReduction, runs_on_gpu
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
@@ -61,6 +61,7 @@ class ThreadSolver:
         )
         self._pieces.piece.from_numpy(np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts)))
         self._pieces.spring_of_colour.from_numpy(starts[springs.piece_of_colour.to_numpy()])
+        self._excess = LaneReduction(maxima=1, sums=1)
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
             self._rows *= 2
@@ -94,7 +95,8 @@ class ThreadSolver:
     def excess(self, state: ClothState, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
         springs = self._springs
-        found = measure_excess(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt)
+        share = self._excess.over(springs.count)
+        found = measure_excess(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, share)
         return float(found[0]), int(found[1])
 
 

@@ -21,8 +21,6 @@ GPU_LANES = 32768  # few for a CPU, whose threads read best what lies together; 
 BRANCHES, LAST_BRANCHES = 128, 16  # numbers that one node of the tree takes together: of lanes, and at last
 MAX_QUANTITIES = 8  # most maxima and sums of one reduction, which its kernel returns as a vector
 
-LOWEST_RANK, HIGHEST_RANK = -(2**31) + 1, 2**31 - 1
-
 Results = ti.types.vector(MAX_QUANTITIES, ti.f32)
 
 
@@ -115,40 +113,6 @@ def device_lanes() -> Lanes:
 def is_finite(value: ti.f32) -> ti.i32:
     """Whether a number is neither NaN nor infinite; looks at the bits, as `fast_math` folds `x != x` to false."""
     return ti.cast((ti.bit_cast(value, ti.i32) & 0x7F800000) != 0x7F800000, ti.i32)
-
-
-def lane_count() -> int:
-    """Lanes of the device Taichi runs on."""
-    return GPU_LANES if runs_on_gpu() else CPU_LANES
-
-
-@ti.func
-def items_of(count: ti.i32) -> ti.i32:
-    """Most numbers of one of `lane_count` lanes; for kernels that find the count themselves."""
-    return (count + ti.static(lane_count()) - 1) // ti.static(lane_count())
-
-
-@ti.func
-def item_of(lane: ti.i32, k: ti.i32, items: ti.i32) -> ti.i32:
-    """Number k of a lane, as `Lanes` shares them out; may be beyond the last."""
-    return lane + k * ti.static(GPU_LANES) if ti.static(runs_on_gpu()) else lane * items + k
-
-
-@ti.func
-def rank(value: ti.f32) -> ti.i32:
-    """Integer that grows with a number, and is largest for one that is not finite.
-
-    An atomic maximum of these into a variable, once a lane of `lane_count`, costs a GPU nothing; one of floats 1 ms.
-    """
-    bits = ti.bit_cast(value, ti.i32)
-    is_usual = (bits & 0x7F800000) != 0x7F800000
-    return ti.select(is_usual, bits ^ ((bits >> 31) & HIGHEST_RANK), HIGHEST_RANK)
-
-
-@ti.func
-def of_rank(rank: ti.i32) -> ti.f32:
-    """The number of a rank; NaN of the largest."""
-    return ti.bit_cast(rank ^ ((rank >> 31) & HIGHEST_RANK), ti.f32)
 
 
 @func
