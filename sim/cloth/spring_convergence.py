@@ -95,14 +95,8 @@ def measure_excess_in_lines(
     """
     ti.loop_config(serialize=True)
     largest, unconverged = 0.0, 0.0
-    inner, outer = (
-        ti.select(along.is_turned == 1, along.length - 1, lines),
-        ti.select(along.is_turned == 1, lines, along.length - 1),
-    )
-    for row in range(outer):
-        for place in range(inner):
-            # Node by node as they lie in memory.
-            line, k = ti.select(along.is_turned == 1, row, place), ti.select(along.is_turned == 1, place, row)
+    for line in range(lines):
+        for k in range(along.length - 1):
             block = line // LANES + k * along.strips
             if along.is_turned:
                 block += turned
