@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import taichi as ti
 
-from sim.cloth.bundles import Air, AirAtNodes
+from sim.cloth.bundles import Air, NodeMotion, Nodes
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
-from sim.core.arrays import Floats, Vectors
+from sim.core.arrays import Integers, Vectors
 from sim.core.launch import kernel
 
 WIND = -1
@@ -29,7 +29,7 @@ class ClothAir:
         inverse_mass: area of cloth over the mass of the air that it acts on [m²/kg], (k,); 0 for wind.
         source: number of what the air belongs to, (k,) int32; `WIND` for wind.
         density: of the air [kg/m³], (k,); 0 where it drags nothing.
-        force: of the air on each triangle in the last substep [N], (k,) vec3; of those that `blow` was called for.
+        force: of the air on each triangle in the last substep [N], (k,) vec3; of those that `predict` was called for.
         impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3; of those, too.
         wind: of the parameters [m/s], (k,) vec3.
         share: of each node in the force on any of its triangles [-], (n,).
@@ -64,11 +64,6 @@ class ClothAir:
         self.share = ti.ndarray(ti.f32, state.vertex_count)
         self.share.from_numpy((host.node_area / around).astype(np.float32))
 
-    @property
-    def at_nodes(self) -> AirAtNodes:
-        """The forces for kernels."""
-        return AirAtNodes(self.force, self.share, self.triangle_start, self.triangle_list)
-
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
         """Drag and wind as the parameters have them now; air that a coupling put there stays.
 
@@ -95,15 +90,26 @@ class ClothAir:
         self.velocity.from_numpy(np.where(is_wind[:, None], wind_of, self.velocity.to_numpy()))
         self.acts = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
 
-    def blow(self, cloths: range, gravity: ti.math.vec3, dt: float) -> None:
-        """Compute the force of a step of dt [s] on some cloths, and add to the impulse."""
+    def predict(self, cloths: range, gravity: ti.math.vec3, dt: float) -> None:
+        """Accelerate some cloths by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
         state = self._state
-        if self.acts:
-            first, end = (int(state.host.first_triangle[number]) for number in (cloths.start, cloths.stop))
-            air = Air(self.velocity, self.inverse_mass, self._drag, self.share, self.force, self.impulse)
-            blow_on_triangles(
-                state.position, state.velocity, state.inverse_mass, state.triangles, first, end, air, gravity, dt
-            )
+        triangles, nodes = (
+            (int(firsts[cloths.start]), int(firsts[cloths.stop]))
+            for firsts in (state.host.first_triangle, state.host.first_node)
+        )
+        predict_in_air(
+            state.position,
+            state.triangles,
+            *(triangles if self.acts else (0, 0)),
+            Air(self.velocity, self.inverse_mass, self._drag, self.share, self.force, self.impulse),
+            self.triangle_start,
+            self.triangle_list,
+            state.nodes,
+            state.motion,
+            *nodes,
+            gravity,
+            dt,
+        )
 
 
 @ti.func
@@ -135,18 +141,27 @@ def drag_along(
 
 
 @kernel
-def blow_on_triangles(
+def predict_in_air(
     position: Vectors,
-    velocity: Vectors,
-    inverse_mass: Floats,
     triangles: Triangles,
+    first_triangle: ti.i32,
+    end_triangle: ti.i32,
+    air: Air,
+    triangle_start: Integers,
+    triangle_list: Integers,
+    nodes: Nodes,
+    motion: NodeMotion,
     first: ti.i32,
     end: ti.i32,
-    air: Air,
     gravity: ti.math.vec3,
     dt: ti.f32,
 ):
-    """Force of the air on each triangle [N], normal and tangential, quadratic in the speed of the air past it.
+    """Accelerate nodes by gravity and by their share of the force on each of their triangles; where that leads in dt.
+
+    Of no triangles, if the air does not act, there is no force. Nodes and triangles are those from the first to before
+    the end.
+
+    The force of the air on each triangle [N] is normal and tangential, quadratic in the speed of the air past it:
 
         F = rho A / 2 (C_n |v_n| v_n + C_t |v_t| v_t),   v_n + v_t = air - cloth
 
@@ -158,7 +173,8 @@ def blow_on_triangles(
     with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
     not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
     """
-    for t in range(first, end):
+    first_node, end_node = first, end  # before the first loop: found between two, they would be a launch of their own
+    for t in range(first_triangle, end_triangle):
         a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
         x_a = position[a]
         cross = (position[b] - x_a).cross(position[c] - x_a)
@@ -168,11 +184,12 @@ def blow_on_triangles(
             inverse = ti.rsqrt(squared)
             area = 0.5 * squared * inverse
             normal = inverse * cross
-            mean = air.share[a] * velocity[a] + air.share[b] * velocity[b] + air.share[c] * velocity[c]
+            mean = air.share[a] * motion.velocity[a] + air.share[b] * motion.velocity[b]
+            mean += air.share[c] * motion.velocity[c]
             free = 0.0
             for k in ti.static(range(3)):
                 i = triangles[t][k]
-                free += ti.select(inverse_mass[i] > 0.0, air.share[i], 0.0)
+                free += ti.select(nodes.inverse_mass[i] > 0.0, air.share[i], 0.0)
             mobility = free * area / air.drag[t][2]
             air_mobility = air.inverse_mass[t]
             past = air.velocity[t] - mean - dt * free * gravity
@@ -190,3 +207,16 @@ def blow_on_triangles(
             force *= area
             air.impulse[t] = air.impulse[t] + dt * force  # += is an atomic operation
         air.force[t] = force
+    for i in range(first_node, end_node):
+        w_i = nodes.inverse_mass[i]
+        if w_i > 0.0:
+            v_i = motion.velocity[i] + dt * gravity
+            if end_triangle > first_triangle:
+                force = ti.math.vec3(0.0)
+                for k in range(triangle_start[i], triangle_start[i + 1]):
+                    force += air.force[triangle_list[k]]
+                v_i += dt * w_i * air.share[i] * force
+            motion.velocity[i] = v_i
+            nodes.displacement[i] = motion.carry[i] + dt * v_i
+        else:
+            nodes.displacement[i] = motion.carry[i]

@@ -120,16 +120,6 @@ class Air(NamedTuple):
     impulse: Vectors  # [N s], (k,)
 
 
-@bundle
-class AirAtNodes(NamedTuple):
-    """Forces of the air as nodes gather them."""
-
-    force: Vectors  # on each triangle [N], (k,)
-    share: Floats  # [-], (n,)
-    triangle_start: Integers  # of each node in the list, (n + 1,)
-    triangle_list: Integers  # (3 k,)
-
-
 # --- rows of rectangles ---------------------------------------------------------------------------------------------
 
 
@@ -276,17 +266,6 @@ class PatchPairArrays(NamedTuple):
     expired: Integers
 
 
-@bundle
-class Searches(NamedTuple):
-    """Numbers of the pairs of patches that are searched, for vertices near triangles and for edges."""
-
-    count: ti.i32
-    numbers: Integers
-    edge_count: ti.i32
-    edge_numbers: Integers
-    lanes: ti.i32  # threads that share a pair
-
-
 # --- pairs of elements ----------------------------------------------------------------------------------------------
 
 
@@ -299,15 +278,6 @@ class PairPieces(NamedTuple):
     pairs: Quadruples
     wanted: Floats  # [m]
     due: Floats  # [m]
-
-
-@bundle
-class PieceRoom(NamedTuple):
-    """Pieces of a list that may have to become longer."""
-
-    pieces: Quadruples  # (p,)
-    end: Integers  # of the list; how many pieces are searched again
-    again: Integers  # their numbers
 
 
 @bundle
@@ -352,7 +322,7 @@ class Contacts(NamedTuple):
     kind: Integers
     arm: Vectors  # [m]
     friction: Floats  # [-]
-    counter: Integers  # (1,)
+    counter: Integers  # (3,)
     capacity: ti.i32
 
 
@@ -388,7 +358,7 @@ class PushedNodes(NamedTuple):
 class NodeSums(NamedTuple):
     """Numbers of each node that are found as contacts are weighed."""
 
-    counter: Integers  # contacts that push, nodes that they push, and how often, (3,)
+    counter: Integers  # contacts that push, nodes that they push, and how often; whether contacts miss much, (4,)
     predicted: Vectors  # displacement without contacts [m], (n,)
     shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
     held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Protocol
 
@@ -12,7 +12,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import NodeSums, PatchMotion, PushedNodes
-from sim.cloth.continuous_response import STEPS, begin_push, push_on, repair_crossings
+from sim.cloth.continuous_response import STEPS, begin_push, push_on
 from sim.cloth.continuous_zones import ImpactZones
 from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
@@ -30,14 +30,8 @@ MORE_ITERATIONS = 16
 """Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
 in stacks and impacts; two layers under their weight need one step."""
 
-TOLERANCE = 0.02
-"""Part of their thickness by which contacts may miss what they should keep."""
-
 REPAIRS = 4
 """Rounds in which crossing pairs are pushed before they become impact zones."""
-
-LEAST_GAP = 0.02
-"""Layers are never let nearer than this, in their thickness, as far as contacts and impact zones decide it."""
 
 RECOVERY_TIME_S = 0.01
 """Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""
@@ -72,17 +66,21 @@ class NearCloth(Protocol):
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns a bound [m], which is not finite or huge after a blow-up."""
 
-    def prepare(self, state: ClothState) -> None:
-        """After `look`: have all pairs listed that may meet in this substep."""
-
     def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
-        """Append the pairs that are too near; `recovery` is the share of a missing distance that comes back [-]."""
+        """After `look`: append the pairs that are too near; `recovery` is the share of a missing distance that comes
+        back [-]."""
 
-    def measure_changes(self, state: ClothState, predicted: ti.Ndarray) -> tuple[float, float]:
-        """How far contacts displaced vertices at most [m]; and those that they displaced farther than allowed for."""
+    def make_room_for(self, ends: Sequence[int]) -> bool:
+        """Whether lists were too short for what `find` searched, so that it has to go on; now there is room."""
 
-    def follow(self, state: ClothState, *, is_changed: bool) -> None:
-        """A substep is over, in which `measure_changes` was asked, or not."""
+    def finish(
+        self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
+    ) -> Sequence[int]:
+        """Test so many contacts; if none of their pairs may have crossed, the substep is over.
+
+        Returns how many may have; whether contacts, if displacements are `changed` by them, displaced vertices farther
+        than allowed for, so that it is not over either; and whether any displacement is not finite.
+        """
 
 
 class ContinuousContacts:
@@ -123,15 +121,14 @@ class ContinuousContacts:
         )
         self._pushed.support.fill(0.0)
         self._sums = NodeSums(
-            counter=ti.ndarray(ti.i32, 3),
+            counter=ti.ndarray(ti.i32, 4),
             predicted=ti.Vector.ndarray(3, ti.f32, n),
             shares=ti.ndarray(ti.i32, n),
             held_sums=ti.ndarray(ti.i32, 6 * n),
             lever=ti.ndarray(ti.f32, n),
             pressing_body=ti.ndarray(ti.i32, n),
         )
-        self._crossing, self._crossing_count = ti.ndarray(ti.i32, 4 * n), ti.ndarray(ti.i32, 1)
-        self._missing, self._ends = LaneReduction(maxima=1, sums=0), LaneReduction(maxima=6, sums=0)
+        self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
         self._meets_cloth, self._is_warm = False, False
@@ -143,16 +140,17 @@ class ContinuousContacts:
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
         n, first = state.vertex_count, state.host.first_node
-        velocity = self._box(state.velocity, 0, n)
+        velocity = box_of(state.velocity, 0, n, self._ends)
         shortest = self.rigid.stable_dt(
             *velocity,
-            lambda: self._box(state.position, 0, n),
+            lambda: box_of(state.position, 0, n, self._ends),
             at_most=self._little_motion(velocity, at_most) if self._meets_cloth else at_most,
         )
         if shortest == at_most or len(state.names) == 1:
             return shortest
         velocities, places = (
-            [self._box(vectors, *ends) for ends in pairwise(first)] for vectors in (state.velocity, state.position)
+            [box_of(vectors, *ends, self._ends) for ends in pairwise(first.tolist())]
+            for vectors in (state.velocity, state.position)
         )
         shortest = at_most
         for number, (velocity, place) in enumerate(zip(velocities, places, strict=True)):
@@ -169,9 +167,6 @@ class ContinuousContacts:
             together = self._little_motion((velocities[a][0], 0.5 * closing), shortest)
             shortest = min(shortest, max(together, from_far))
         return shortest
-
-    def _box(self, vectors: ti.Ndarray, first: int, end: int) -> Box:
-        return box_of(vectors, int(first), int(end), self._ends)
 
     def _little_motion(self, velocity: Box, at_most: float) -> float:
         """Largest step [s] in which cloth with such a box of velocities [m/s] moves little against itself."""
@@ -231,21 +226,16 @@ class ContinuousContacts:
             self._warm_up(state)
             self._is_warm = True
         while True:
-            self._near.prepare(state)
             found = self._find(state, dt)
-            if not found:
-                left = 0
-                break
-            self._push(state, found, is_first=True, relax=relax)
-            left = self._keep_apart(state, found)
-            change, beyond = self._near.measure_changes(state, self._sums.predicted)
-            if not math.isfinite(change):
+            if found:
+                self._push(state, found, is_first=True, relax=relax)
+            left, is_beyond, not_finite = self._keep_apart(state, found)
+            if not_finite:
                 return  # as above
             # What was pushed farther than foreseen may have met what was not looked at.
-            if not beyond:
+            if not is_beyond:
                 break
             self._near.look(state)
-        self._near.follow(state, is_changed=found > 0)
         self._substeps += 1
         self._moved_as_one += self._nodes_as_one
         self._found += found
@@ -256,9 +246,6 @@ class ContinuousContacts:
         for short in sorted({self._is_short(0), self._is_short(self._contacts.capacity)}):
             self._begin_push(state, 0, is_first=True, short=short)
             self._push_on(0, 0, 0, short=short)
-            if self._meets_cloth:
-                self._crossings(state, 0, short=short)
-        self._near.measure_changes(state, self._sums.predicted)
         if self._meets_cloth:
             self._pairs.warm_up()
 
@@ -266,9 +253,9 @@ class ContinuousContacts:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
         while True:
             self._near.find(state, self._contacts, recovery)
-            self.rigid.find(state, self._patches, self._near.motion, self._contacts, recovery)
-            found = self._contacts.take_found()
-            if not self._contacts.make_room_for(found):
+            found, *ends = self.rigid.find(state, self._patches, self._near.motion, self._contacts, recovery)
+            is_short = self._near.make_room_for(ends)
+            if not self._contacts.make_room_for(found) and not is_short:
                 return found
 
     def _push(
@@ -277,12 +264,12 @@ class ContinuousContacts:
         """Push; first in turns with the springs, for as long as these `relax`."""
         short = self._is_short(count)
         while True:
-            pushing, touched, missing = self._begin_push(state, count, is_first=is_first, short=short)
+            pushing, touched, is_missing = self._begin_push(state, count, is_first=is_first, short=short)
             self._iterations += STEPS if pushing else 0
             if not pushing or not relax():
                 break
             is_first = False
-        if pushing and not np.int32(missing).view(np.float32) <= TOLERANCE:
+        if pushing and is_missing:
             for first in range(0, MORE_ITERATIONS, STEPS):
                 self._push_on(pushing, touched, first, short=short)
             self._iterations += MORE_ITERATIONS
@@ -300,7 +287,6 @@ class ContinuousContacts:
             self._sums,
             state.thickness,
             self.rigid.bodies.pushed,
-            self._missing.tree,
             int(is_first),
             short,
         )
@@ -322,54 +308,34 @@ class ContinuousContacts:
             short,
         )
 
-    def _keep_apart(self, state: ClothState, count: int) -> int:
-        """Push, and at last tie together, until no pair can have crossed; how many pairs still may have."""
-        if not self._meets_cloth:
-            return 0
-        short = self._is_short(count)
+    def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
+        """Push, and at last tie together, until no pair can have crossed; what `NearCloth.finish` returns then."""
         for _ in range(REPAIRS):
-            failed = self._crossings(state, count, short=short)
-            if not failed:
-                return 0
-            self._repaired += failed
+            found = self._finish(state, count)
+            if not found[0]:
+                return found
+            self._repaired += found[0]
             self._push(state, count, is_first=False)
-        failed = self._crossings(state, count, short=short)
-        if failed:
-            zones = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0)
-            while failed and zones.join(self._contacts.vertices.to_numpy()[:count][self._crossing_rows(count)]):
+        found = self._finish(state, count)
+        if found[0]:
+            zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
+            while found[0] and zones.join(
+                contacts.vertices.to_numpy()[:count][contacts.crossing.to_numpy()[:count] == 1]
+            ):
                 state.displacement.from_numpy(zones.apply(state.displacement.to_numpy()))
-                failed = self._crossings(state, count, short=short)
+                found = self._finish(state, count)
             self._zone_vertices += len(zones.members)
             of_cloths = np.bincount(state.host.body[zones.members], minlength=len(self._nodes_as_one))
             np.maximum(self._nodes_as_one, of_cloths, out=self._nodes_as_one)
-        return failed
+        return found if not found[0] else (found[0], *self._finish(state, 0, is_changed=True)[1:])
 
-    def _crossings(self, state: ClothState, count: int, *, short: bool) -> int:
-        contacts = self._contacts
-        if self._crossing.shape[0] < contacts.capacity:
-            self._crossing = ti.ndarray(ti.i32, contacts.capacity)
-        return int(
-            repair_crossings(
-                count,
-                contacts.found,
-                contacts.impulse,
-                state.position,
-                state.displacement,
-                state.inverse_mass,
-                state.thickness,
-                LEAST_GAP,
-                self._crossing,
-                self._crossing_count,
-                short,
-            )
-        )
+    def _finish(self, state: ClothState, count: int, *, is_changed: bool | None = None) -> Sequence[int]:
+        is_changed = count > 0 if is_changed is None else is_changed
+        return self._near.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
 
     def _is_short(self, count: int) -> bool:
         """Whether loops over so many contacts, and over all vertices, are."""
         return is_short(count, CONTACT_NS) and is_short(self._state.vertex_count, COPIED_NODE_NS)
-
-    def _crossing_rows(self, count: int) -> NDArray[np.bool_]:
-        return self._crossing.to_numpy()[:count] == 1
 
 
 def _momenta_from(first: int) -> tuple[float, ...]:

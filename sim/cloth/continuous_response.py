@@ -29,7 +29,7 @@ from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, WALL
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import Tree, reduced, runs_on_gpu
+from sim.core.reductions import runs_on_gpu
 
 SHARES_PER_UNIT = 65536.0
 """Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
@@ -41,11 +41,17 @@ twenty times what the contact lacks. Others are only watched: a corner far from 
 LARGEST_SHARE = 0.9
 """How much of a pair's separation a substep may use up: what is left keeps the sides apart for the next one."""
 
+LEAST_GAP = 0.02
+"""Layers are never let nearer than this, in their thickness, as far as contacts and impact zones decide it."""
+
 KEPT_BY_REPAIR = 0.3
 """Share of its separation that a pair keeps which would have crossed: above 1 - `LARGEST_SHARE`."""
 
 STEPS = 8
 """Steps of the iteration in one launch: what all iterations have at least."""
+
+TOLERANCE = 0.02
+"""Part of their thickness by which contacts may miss what they should keep."""
 
 Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
@@ -89,29 +95,23 @@ def weigh_contacts(
     normal along that, from `held_sums`, `lever` and `pressing_body`.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end, bodies_end, supported_end = (
-        count,
-        vertex_count,
-        bodies.count,
-        bodies.may_move * vertex_count,
-    )
-    sums.counter[0], sums.counter[1], sums.counter[2] = 0, 0, 0
+    contacts_end, vertices_end = count, vertex_count
+    all_end = ti.max(vertex_count, bodies.count)
+    for k in ti.static(range(4)):
+        sums.counter[k] = 0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for i in range(vertices_end):
-        sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
-        if is_first == 1:
-            sums.predicted[i] = nodes.displacement[i]
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for i in range(supported_end):
-        sums.lever[i], sums.pressing_body[i] = 0.0, -1
-        for k in ti.static(range(6)):
-            sums.held_sums[6 * i + k] = 0
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for b in range(bodies_end):
-        bodies.load[b] = ti.cast(0, ti.i64)
+    for i in range(all_end):
+        if i < vertex_count:
+            sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
+            if is_first == 1:
+                sums.predicted[i] = nodes.displacement[i]
+            if bodies.may_move == 1:
+                sums.lever[i], sums.pressing_body[i] = 0.0, -1
+                for k in ti.static(range(6)):
+                    sums.held_sums[6 * i + k] = 0
+        if i < bodies.count:
+            bodies.load[i] = ti.cast(0, ti.i64)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for c in range(contacts_end):
@@ -142,18 +142,17 @@ def weigh_contacts(
             nodes.touched[ti.atomic_add(sums.counter[1], 1)] = i
             first = ti.atomic_add(sums.counter[2], nodes.uses[2 * i + 1])
             nodes.uses[2 * i], nodes.uses[2 * i + 1] = first, first
+        if bodies.may_move == 1:
+            b = sums.pressing_body[i]
+            nodes.support[i] = ti.math.vec3(0.0)
+            if b >= 0 and nodes.inverse_mass[i] > 0.0:
+                of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
+                own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
+                nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
+    pushing_end = sums.counter[0]
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for i in range(supported_end):
-        b = sums.pressing_body[i]
-        nodes.support[i] = ti.math.vec3(0.0)
-        if b >= 0 and nodes.inverse_mass[i] > 0.0:
-            of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
-            own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
-            nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for place in range(sums.counter[0]):
+    for place in range(pushing_end):
         c = impulses.pushing[place]
         if is_first == 1:
             impulses.impulse[c] = ti.math.vec3(0.0)
@@ -311,71 +310,92 @@ def push_apart(
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, touched_end, bodies_end = count, touched_count, bodies.count
-    new_contacts_end, new_touched_end, new_bodies_end = (
-        starts * count,
-        starts * touched_count,
-        starts * 2 * bodies.count,
-    )
+    moved_end = touched_count + bodies.count * ti.static(int(runs_on_gpu()))
+    new_end = starts * ti.max(count, touched_count, bodies.count)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for place in range(new_touched_end):
-        i = nodes.touched[place]
-        nodes.start[i] = nodes.displacement[i]
-        nodes.reached[i] = nodes.displacement[i]
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for m in range(new_bodies_end):
-        bodies.motion_start[m] = bodies.motion[m]
-        bodies.motion_reached[m] = bodies.motion[m]
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for place in range(new_contacts_end):
-        c = impulses.pushing[place]
-        impulses.impulse_before[c] = impulses.impulse[c]
-        impulses.impulse_given[c] = impulses.impulse[c]
-    for step in ti.static(range(STEPS)):
-        if ti.static(is_short):
-            ti.loop_config(serialize=True)
-        for place in range(contacts_end):
-            c = impulses.pushing[place]
-            n = contacts.normal[c]
-            w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
-            ahead = impulses.impulse[c] + momenta[step] * (impulses.impulse[c] - impulses.impulse_before[c])
-            along = ti.max(ahead.dot(n) + (contacts.floor[c] - w.dot(n)) / impulses.mobility[c], 0.0)
-            sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / impulses.mobility[c]
-            held, length = contacts.friction[c] * along, sideways.norm()
-            if length > held:
-                sideways *= held / length
-            after = along * n + sideways
-            impulses.impulse_before[c] = impulses.impulse[c]
-            impulses.impulse[c] = after
-            impulses.push[place] = (after - ahead) / impulses.unit
-            # What nothing moves need not hear of it before the end: its sums are in the way of all threads.
-            b = contacts.kind[c]
-            most = 0.0
-            if b >= 0 and (after - ahead).norm_sqr() > 0.0:
-                most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
-            if most > 0.0:
-                give_body(impulses.push[place], b, contacts.arm[c], bodies.gathered)
-        if ti.static(is_short):
-            ti.loop_config(serialize=True)
-        for place in range(touched_end):
+    for place in range(new_end):
+        if place < touched_count:
             i = nodes.touched[place]
-            given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
-            u = nodes.displacement[i] + (nodes.inverse_mass[i] * impulses.unit) * given
-            nodes.displacement[i] = u + momenta[step + 1] * (u - nodes.reached[i])
-            nodes.reached[i] = u
-        if ti.static(not runs_on_gpu()):
-            ti.loop_config(serialize=True)
-        for b in range(bodies_end):
-            shift = bodies.motion[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(bodies.gathered, 6 * b)
-            turn = bodies.motion[2 * b + 1] + impulses.unit * (
-                bodies.inverse_inertia[b] @ take(bodies.gathered, 6 * b + 3)
-            )
-            bodies.motion[2 * b] = shift + momenta[step + 1] * (shift - bodies.motion_reached[2 * b])
-            bodies.motion[2 * b + 1] = turn + momenta[step + 1] * (turn - bodies.motion_reached[2 * b + 1])
-            bodies.motion_reached[2 * b] = shift
-            bodies.motion_reached[2 * b + 1] = turn
+            nodes.start[i] = nodes.displacement[i]
+            nodes.reached[i] = nodes.displacement[i]
+        if place < bodies.count:
+            for m in ti.static(range(2)):
+                bodies.motion_start[2 * place + m] = bodies.motion[2 * place + m]
+                bodies.motion_reached[2 * place + m] = bodies.motion[2 * place + m]
+        if place < count:
+            c = impulses.pushing[place]
+            impulses.impulse_before[c] = impulses.impulse[c]
+            impulses.impulse_given[c] = impulses.impulse[c]
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+        for step in range(STEPS):
+            for place in range(contacts_end):
+                push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
+            for place in range(touched_end):
+                move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
+            for b in range(bodies_end):
+                move_body(b, momenta[step + 1], impulses, bodies)
+    else:
+        for step in ti.static(range(STEPS)):
+            for place in range(contacts_end):
+                push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
+            for place in range(moved_end):
+                if place < touched_end:
+                    move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
+                elif ti.static(runs_on_gpu()):
+                    move_body(place - touched_end, momenta[step + 1], impulses, bodies)
+            if ti.static(not runs_on_gpu()):
+                ti.loop_config(serialize=True)
+                for b in range(bodies_end):
+                    move_body(b, momenta[step + 1], impulses, bodies)
+
+
+@func
+def push_contact(
+    place: ti.i32, momentum: ti.f32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies
+):
+    """What a contact gives in a step, from its place in `pushing`."""
+    c = impulses.pushing[place]
+    n = contacts.normal[c]
+    w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
+    ahead = impulses.impulse[c] + momentum * (impulses.impulse[c] - impulses.impulse_before[c])
+    along = ti.max(ahead.dot(n) + (contacts.floor[c] - w.dot(n)) / impulses.mobility[c], 0.0)
+    sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / impulses.mobility[c]
+    held, length = contacts.friction[c] * along, sideways.norm()
+    if length > held:
+        sideways *= held / length
+    after = along * n + sideways
+    impulses.impulse_before[c] = impulses.impulse[c]
+    impulses.impulse[c] = after
+    impulses.push[place] = (after - ahead) / impulses.unit
+    # What nothing moves need not hear of it before the end: its sums are in the way of all threads.
+    b = contacts.kind[c]
+    most = 0.0
+    if b >= 0 and (after - ahead).norm_sqr() > 0.0:
+        most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
+    if most > 0.0:
+        give_body(impulses.push[place], b, contacts.arm[c], bodies.gathered)
+
+
+@func
+def move_node(i: ti.i32, momentum: ti.f32, impulses: Impulses, nodes: PushedNodes):
+    """Displace a vertex by what its contacts give it in a step, and ahead by the momentum of the next."""
+    given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
+    u = nodes.displacement[i] + (nodes.inverse_mass[i] * impulses.unit) * given
+    nodes.displacement[i] = u + momentum * (u - nodes.reached[i])
+    nodes.reached[i] = u
+
+
+@func
+def move_body(b: ti.i32, momentum: ti.f32, impulses: Impulses, bodies: PushedBodies):
+    """The same of a body."""
+    shift = bodies.motion[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(bodies.gathered, 6 * b)
+    turn = bodies.motion[2 * b + 1] + impulses.unit * (bodies.inverse_inertia[b] @ take(bodies.gathered, 6 * b + 3))
+    bodies.motion[2 * b] = shift + momentum * (shift - bodies.motion_reached[2 * b])
+    bodies.motion[2 * b + 1] = turn + momentum * (turn - bodies.motion_reached[2 * b + 1])
+    bodies.motion_reached[2 * b] = shift
+    bodies.motion_reached[2 * b + 1] = turn
 
 
 @func
@@ -420,39 +440,6 @@ def finish_push(
         bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
 
 
-@func
-def most_missing(
-    count: ti.i32,
-    contacts: Contacts,
-    pushing: Integers,
-    displacement: Vectors,
-    thickness: Floats,
-    body_motion: Vectors,
-    tree: Tree,
-    is_short: ti.template(),
-) -> ti.f32:
-    """The most that a contact's displacement is below its floor, in thicknesses of what touches."""
-    lanes_end = tree.lanes
-    # Lanes as those of `sim.core.reductions.Lanes`, for a number of contacts that the host does not know yet.
-    items = (count + tree.lanes - 1) // tree.lanes
-    lane_step, item_step = items, 1
-    if ti.static(runs_on_gpu()):
-        lane_step, item_step = 1, tree.lanes
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for lane in range(lanes_end):
-        missing = 0.0
-        for k in range(items):
-            place = lane * lane_step + k * item_step
-            if place < count:
-                c = pushing[place]
-                w = relative_displacement(c, contacts, displacement, body_motion)
-                least = contacts.floor[c] - w.dot(contacts.normal[c])
-                missing = ti.max(missing, least / thickness_between(contacts.vertices[c], thickness))
-        tree.partial[lane] = missing
-    return reduced(tree.partial, tree.lanes, tree.quantities, tree.maxima, tree.nodes)[0]
-
-
 @kernel
 def begin_push(
     momenta: Momenta,
@@ -464,22 +451,27 @@ def begin_push(
     sums: NodeSums,
     thickness: Floats,
     bodies: PushedBodies,
-    tree: Tree,
     is_first: ti.i32,
     is_short: ti.template(),
 ) -> ti.math.ivec3:
     """A round of contacts in one launch: which of them push, some steps of the iteration, and where these lead.
 
-    Returns how many contacts push, how many vertices they push, and the bits of what `most_missing` is.
+    Returns how many contacts push, how many vertices they push, and whether any is below its floor by more than
+    `TOLERANCE`.
     """
     weigh_contacts(count, contacts, impulses, vertex_count, nodes, sums, bodies, is_first, is_short)
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
     push_apart(momenta, 1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
     finish_push(1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
-    missing = most_missing(
-        pushing_count, contacts, impulses.pushing, nodes.displacement, thickness, bodies.motion, tree, is_short
-    )
-    return ti.math.ivec3(pushing_count, touched_count, ti.bit_cast(missing, ti.i32))
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for place in range(pushing_count):
+        c = impulses.pushing[place]
+        w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
+        missing = contacts.floor[c] - w.dot(contacts.normal[c])
+        if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
+            sums.counter[3] = 1
+    return ti.math.ivec3(pushing_count, touched_count, sums.counter[3])
 
 
 @kernel
@@ -500,71 +492,64 @@ def push_on(
     finish_push(finishes, count, touched_count, contacts, impulses, nodes, bodies, is_short)
 
 
-@kernel
-def repair_crossings(
-    count: ti.i32,
+@func
+def repair_crossing(
+    c: ti.i32,
     contacts: Contacts,
     impulse: Vectors,
     position: Vectors,
     displacement: Vectors,
     inverse_mass: Floats,
     thickness: Floats,
-    least_gap_in_thicknesses: ti.f32,
     crossing: Integers,
     counter: Integers,
-    is_short: ti.template(),
-) -> ti.i32:
-    """Count the pairs that are not certainly apart all through the substep, and have their worst vertices pushed.
+):
+    """Count a pair if it is not certainly apart all through the substep, and have its worst vertices pushed.
 
     Two sides that a plane across n separates at the start, and one across n at the end, are separated all the time in
     between: n . (x_a - x_b) of any two vertices is linear in time. So it is enough that the separation along n, that
     of the nearest two vertices, keeps 1 - `LARGEST_SHARE` of what it was; or all of it where it was none.
     `crossing` gets 1 for pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
     """
-    counter[0] = 0
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for c in range(count):
-        crossing[c] = 0
-        mobile = 0.0
+    crossing[c] = 0
+    mobile = 0.0
+    for k in ti.static(range(4)):
+        mobile = ti.max(mobile, inverse_mass[contacts.vertices[c][k]])
+    if contacts.kind[c] < 0 and contacts.kind[c] >= EDGE_EDGE and mobile > 0.0:
+        n, v = contacts.normal[c], contacts.vertices[c]
+        first = ti.select(contacts.kind[c] == EDGE_EDGE, 2, 1)
+        origin, size = position[v[0]], 0.0
+        start = ti.math.vec4(0.0)
+        end = ti.math.vec4(0.0)
         for k in ti.static(range(4)):
-            mobile = ti.max(mobile, inverse_mass[contacts.vertices[c][k]])
-        if contacts.kind[c] < 0 and contacts.kind[c] >= EDGE_EDGE and mobile > 0.0:
-            n, v = contacts.normal[c], contacts.vertices[c]
-            first = ti.select(contacts.kind[c] == EDGE_EDGE, 2, 1)
-            origin, size = position[v[0]], 0.0
-            start = ti.math.vec4(0.0)
-            end = ti.math.vec4(0.0)
+            x = position[v[k]] - origin
+            start[k] = n.dot(x)
+            end[k] = start[k] + n.dot(displacement[v[k]])
+            size = ti.max(size, x.norm(), (displacement[v[k]] - displacement[v[0]]).norm())
+        low, low_start, high, high_start = 1.0e30, 1.0e30, -1.0e30, -1.0e30
+        lowest, highest = 0, 0
+        for k in ti.static(range(4)):
+            if k < first:
+                low_start = ti.min(low_start, start[k])
+                if end[k] < low:
+                    low, lowest = end[k], k
+            else:
+                high_start = ti.max(high_start, start[k])
+                if end[k] > high:
+                    high, highest = end[k], k
+        apart = low_start - high_start
+        least_gap = LEAST_GAP * thickness_between(v, thickness)
+        least = ti.min(ti.max((1.0 - LARGEST_SHARE) * apart, least_gap), apart - ROUNDING * size)
+        if low - high < least:
+            ti.atomic_add(counter[0], 1)
+            crossing[c] = 1
+            pair = ti.math.vec4(0.0)
+            between = 0.0
             for k in ti.static(range(4)):
-                x = position[v[k]] - origin
-                start[k] = n.dot(x)
-                end[k] = start[k] + n.dot(displacement[v[k]])
-                size = ti.max(size, x.norm(), (displacement[v[k]] - displacement[v[0]]).norm())
-            low, low_start, high, high_start = 1.0e30, 1.0e30, -1.0e30, -1.0e30
-            lowest, highest = 0, 0
-            for k in ti.static(range(4)):
-                if k < first:
-                    low_start = ti.min(low_start, start[k])
-                    if end[k] < low:
-                        low, lowest = end[k], k
-                else:
-                    high_start = ti.max(high_start, start[k])
-                    if end[k] > high:
-                        high, highest = end[k], k
-            apart = low_start - high_start
-            least_gap = least_gap_in_thicknesses * thickness_between(v, thickness)
-            least = ti.min(ti.max((1.0 - LARGEST_SHARE) * apart, least_gap), apart - ROUNDING * size)
-            if low - high < least:
-                ti.atomic_add(counter[0], 1)
-                crossing[c] = 1
-                pair = ti.math.vec4(0.0)
-                between = 0.0
-                for k in ti.static(range(4)):
-                    if k == lowest:
-                        pair[k], between = 1.0, between + start[k]
-                    if k == highest:
-                        pair[k], between = -1.0, between - start[k]
-                contacts.weights[c] = pair
-                contacts.floor[c] = ti.min(ti.max(KEPT_BY_REPAIR * apart, 2.0 * least_gap), apart) - between
-                impulse[c] = ti.math.vec3(0.0)
-    return counter[0]
+                if k == lowest:
+                    pair[k], between = 1.0, between + start[k]
+                if k == highest:
+                    pair[k], between = -1.0, between - start[k]
+            contacts.weights[c] = pair
+            contacts.floor[c] = ti.min(ti.max(KEPT_BY_REPAIR * apart, 2.0 * least_gap), apart) - between
+            impulse[c] = ti.math.vec3(0.0)

@@ -6,17 +6,11 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import EdgeBlocks, Quadruples, TriangleBlocks
+from sim.cloth.bundles import EdgeBlocks, TriangleBlocks
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE
-from sim.cloth.state import ClothState
-from sim.core.arrays import Integers, Vectors
-from sim.core.launch import kernel
-from sim.core.reductions import runs_on_gpu
-from sim.core.scheduling import begin_sharing, next_item, workers_for
-
-PATCHES_AT_A_TIME = 8
-"""Patches that a thread takes at a time: most of them are not needed."""
+from sim.core.arrays import Vectors
+from sim.core.bundles import func
 
 
 class ElementBlocks:
@@ -36,42 +30,8 @@ class ElementBlocks:
     """
 
     def __init__(self, patches: Patches) -> None:
-        self._patches = patches
-        self._taken = ti.ndarray(ti.i32, 1)
         self.edges = EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
         self.triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
-
-    def enclose(
-        self,
-        state: ClothState,
-        searched: ti.Ndarray,
-        count: int,
-        found: ti.Ndarray,
-        found_edges: ti.Ndarray,
-        needed: ti.Ndarray,
-    ) -> None:
-        """Note where the elements of patches are that are searched; nothing is found in their pairs yet.
-
-        Args:
-            state: at the start of a substep.
-            searched: numbers of pairs of patches, (count,).
-            count: how many.
-            found, found_edges: pieces of both lists.
-            needed: by patch, whether a pair of it is searched; 0 after.
-        """
-        enclose_elements(
-            self._patches.count,
-            workers_for(self._patches.count),
-            self._taken,
-            needed,
-            state.position,
-            self.edges,
-            self.triangles,
-            count,
-            searched,
-            found,
-            found_edges,
-        )
 
 
 def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:
@@ -89,60 +49,21 @@ def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Nda
     return first_block, members, *(ti.ndarray(ti.f32, places) for _ in range(6))
 
 
-@kernel
-def enclose_elements(
-    patch_count: ti.i32,
-    workers: ti.i32,
-    taken: Integers,
-    needed: Integers,
-    position: Vectors,
-    of_edges: EdgeBlocks,
-    of_triangles: TriangleBlocks,
-    count: ti.i32,
-    searched: Integers,
-    found: Quadruples,
-    found_edges: Quadruples,
-):
-    """Midpoints of edges and half the vectors along them, and boxes of triangles, of the patches that are needed."""
-    begin_sharing(taken, 0)
-    for worker in range(workers):
-        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while m < patch_count:
-            if needed[m] == 1:
-                needed[m] = 0
-                for place in range(of_edges.first_block[m] * BLOCK, of_edges.first_block[m + 1] * BLOCK):
-                    middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
-                    if of_edges.edges[place][0] != NONE:
-                        a, b = position[of_edges.edges[place][0]], position[of_edges.edges[place][1]]
-                        middle, half = 0.5 * (a + b), 0.5 * (b - a)
-                    of_edges.mid_x[place], of_edges.mid_y[place], of_edges.mid_z[place] = (
-                        middle[0],
-                        middle[1],
-                        middle[2],
-                    )
-                    of_edges.half_x[place], of_edges.half_y[place], of_edges.half_z[place] = half[0], half[1], half[2]
-                for place in range(of_triangles.first_block[m] * BLOCK, of_triangles.first_block[m + 1] * BLOCK):
-                    low, high = ti.math.vec3(FAR), ti.math.vec3(-FAR)
-                    if of_triangles.triangles[place][0] != NONE:
-                        a, b, c = (
-                            position[of_triangles.triangles[place][0]],
-                            position[of_triangles.triangles[place][1]],
-                            position[of_triangles.triangles[place][2]],
-                        )
-                        low, high = ti.min(a, b, c), ti.max(a, b, c)
-                    of_triangles.low_x[place], of_triangles.low_y[place], of_triangles.low_z[place] = (
-                        low[0],
-                        low[1],
-                        low[2],
-                    )
-                    of_triangles.high_x[place], of_triangles.high_y[place], of_triangles.high_z[place] = (
-                        high[0],
-                        high[1],
-                        high[2],
-                    )
-            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for k in range(count):
-        found[searched[k]][2] = 0
-        found_edges[searched[k]][2] = 0
+@func
+def enclose_elements(m: ti.i32, position: Vectors, of_edges: EdgeBlocks, of_triangles: TriangleBlocks):
+    """Midpoints of edges and half the vectors along them, and boxes of triangles, of a patch."""
+    for place in range(of_edges.first_block[m] * BLOCK, of_edges.first_block[m + 1] * BLOCK):
+        middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
+        if of_edges.edges[place][0] != NONE:
+            a, b = position[of_edges.edges[place][0]], position[of_edges.edges[place][1]]
+            middle, half = 0.5 * (a + b), 0.5 * (b - a)
+        of_edges.mid_x[place], of_edges.mid_y[place], of_edges.mid_z[place] = middle[0], middle[1], middle[2]
+        of_edges.half_x[place], of_edges.half_y[place], of_edges.half_z[place] = half[0], half[1], half[2]
+    for place in range(of_triangles.first_block[m] * BLOCK, of_triangles.first_block[m + 1] * BLOCK):
+        low, high = ti.math.vec3(FAR), ti.math.vec3(-FAR)
+        corners = of_triangles.triangles[place]
+        if corners[0] != NONE:
+            a, b, c = position[corners[0]], position[corners[1]], position[corners[2]]
+            low, high = ti.min(a, b, c), ti.max(a, b, c)
+        of_triangles.low_x[place], of_triangles.low_y[place], of_triangles.low_z[place] = low[0], low[1], low[2]
+        of_triangles.high_x[place], of_triangles.high_y[place], of_triangles.high_z[place] = high[0], high[1], high[2]

@@ -4,5 +4,5 @@ NODE_NS, NODE_IN_ROWS_NS, COPIED_NODE_NS = 14.0, 12.0, 4.0
 """Work a node [ns]: in sums and maxima over nodes, in one loop of springs or air in rows, in copies and tests;
 roughly, as are those below, from processor times at 128 x 128 nodes."""
 
-CONTACT_NS, PATCH_AT_WALLS_NS = 25.0, 90.0
-"""Work of one step of the iteration a contact, and of looking for walls a patch [ns]."""
+CONTACT_NS = 25.0
+"""Work of one step of the iteration a contact [ns]."""

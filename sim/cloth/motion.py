@@ -2,43 +2,13 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import AirAtNodes, NodeMotion, Nodes
+from sim.cloth.bundles import NodeMotion, Nodes
 from sim.core.arrays import Integers, Vectors
 from sim.core.launch import kernel
 from sim.core.reductions import is_finite
 
 LARGEST_MOVE = 2.0**29
 """Most quanta in a step: a quarter of the lattice, so that integers do not overflow."""
-
-
-@kernel
-def predict_displacement(
-    nodes: Nodes,
-    motion: NodeMotion,
-    air: AirAtNodes,
-    is_windy: ti.i32,
-    first: ti.i32,
-    end: ti.i32,
-    gravity: ti.math.vec3,
-    dt: ti.f32,
-):
-    """Accelerate by gravity and by the node's share of the force on each of its triangles; where that leads in dt.
-
-    Nodes from `first` to before `end`.
-    """
-    for i in range(first, end):
-        w_i = nodes.inverse_mass[i]
-        if w_i > 0.0:
-            v_i = motion.velocity[i] + dt * gravity
-            if is_windy:
-                force = ti.math.vec3(0.0)
-                for k in range(air.triangle_start[i], air.triangle_start[i + 1]):
-                    force += air.force[air.triangle_list[k]]
-                v_i += dt * w_i * air.share[i] * force
-            motion.velocity[i] = v_i
-            nodes.displacement[i] = motion.carry[i] + dt * v_i
-        else:
-            nodes.displacement[i] = motion.carry[i]
 
 
 @kernel

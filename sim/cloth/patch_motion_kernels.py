@@ -17,7 +17,7 @@ from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import Results, Share, reduced, runs_on_gpu
+from sim.core.reductions import Share, is_finite, reduced_tree, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
 FAR = 1.0e30
@@ -33,8 +33,8 @@ has met unseen. What positions do besides their displacements, as they are round
 REGULARIZATION = 1.0e-5
 """Part of the inertia of a patch that is added to it, so that it has an inverse."""
 
-PATCHES_AT_A_TIME, PAIRS_AT_A_TIME, LANES_AT_A_TIME = 16, 256, 4
-"""Patches, pairs of them, and lanes of a reduction over them that a thread takes at a time."""
+PATCHES_AT_A_TIME, PAIRS_AT_A_TIME = 16, 256
+"""Patches, and pairs of them, that a thread takes at a time."""
 
 WIDENED = 1.25
 """Contacts may push so many times as far as in the substep before without patches being looked at anew."""
@@ -48,25 +48,47 @@ def look_at_patches(
     vertex_count: ti.i32,
     nodes: TrackedNodes,
     of_vertices: Share,
-    of_patches: Share,
     still: ti.f32,
     corners: PatchNodes,
     patches: PatchBounds,
     budget: PatchBudget,
-    workers: ti.i32,
+    patch_workers: ti.i32,
+    known_astray: ti.f32,
+    met: PatchPairArrays,
+    pair_workers: ti.i32,
+    thickness: ti.f32,
+    least_skin: ti.f32,
+    first_due: Floats,
+    first_due_of_edges: Floats,
+    needed: Integers,
+    counter: Integers,
     taken: Integers,
     is_short: ti.template(),
-) -> Results:
-    """Where patches are, and how they move in this substep.
+) -> ti.math.ivec4:
+    """Where patches are, and how they move in this substep; then, if the list of their pairs holds, which of these have
+    to be searched, and of which some elements are due.
 
     A rigid motion c + w x (x - centre) is fitted to the displacements of each patch, by least squares. The fit decides
-    how small the rest is, not whether it is a bound.
+    how small the rest is, not whether it is a bound. The list holds while what patches spend, with the motion of this
+    substep and what may come besides, is within their reach.
 
-    Returns the largest components of displacements [m], then those of their negatives; how far a vertex is at most from
-    where its last displacement should have led it; and how far the motion of a patch, with what was spent before
-    and may come besides, passes the reach of the list of pairs of patches at most.
+    Args:
+        vertex_count: 0 if patches have been looked at; nothing but `known_astray` is asked then.
+        nodes, of_vertices, corners: the vertices, how lanes share them, and those of each patch.
+        still: see `fit_motion`.
+        patches, budget: get the motion.
+        patch_workers, pair_workers, taken: see `sim.core.scheduling`.
+        known_astray: largest distance of a vertex from where it was left [m].
+        met: the pairs; see `age_pair`.
+        thickness, least_skin, first_due, first_due_of_edges, needed: see `age_pair`.
+        counter: gets the two numbers of pairs, and whether the list does not hold.
+
+    Returns half the diagonal of the box of all displacements, and how far a vertex is at most from where its last
+    displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
+    not hold; and of how many some elements are due.
     """
-    workers_end = workers
+    patches_end, pairs_end = patch_workers, pair_workers
+    counter[0], counter[1], counter[2] = 0, 0, 0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for lane in range(of_vertices.tree.lanes):
@@ -83,29 +105,35 @@ def look_at_patches(
                 of_vertices.tree.partial[(3 + axis) * of_vertices.tree.lanes + lane],
             ) = most[axis], -least[axis]
         of_vertices.tree.partial[6 * of_vertices.tree.lanes + lane] = off
-    ends = reduced(of_vertices.tree.partial, of_vertices.tree.lanes, 7, 7, of_vertices.tree.nodes)
+    ends = reduced_tree(of_vertices.tree)
     middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
-    astray = ti.sqrt(ends[6])
+    size = ti.math.vec3(ends[0] + ends[3], ends[1] + ends[4], ends[2] + ends[5])
+    astray = ti.select(vertex_count > 0, ti.sqrt(ends[6]), known_astray)
     begin_sharing(taken, 0)
-    for worker in range(workers_end):
-        lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
-        while lane < of_vertices.tree.lanes:
-            beyond = -FAR
-            for k in range(of_patches.items):
-                m = lane * of_patches.lane_step + k * of_vertices.item_step
-                if m < corners.count:
-                    fit_motion(m, still, corners, nodes, patches)
-                    budget.moves[m] = (1.0 + SAFETY) * (
-                        (patches.motion.shift[m] - middle).norm()
-                        + patches.motion.turn[m].norm() * patches.motion.radius[m]
-                        + patches.motion.rest[m]
-                    )
-                    budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
-                    beyond = ti.max(beyond, budget.travel[m] - budget.reach[m])
-            of_vertices.tree.partial[lane] = beyond
-            lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
-    worst = reduced(of_vertices.tree.partial, of_vertices.tree.lanes, 1, 1, of_vertices.tree.nodes)
-    return Results(ends[0], ends[1], ends[2], ends[3], ends[4], ends[5], astray, worst[0])
+    for worker in range(patches_end):
+        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while m < corners.count:
+            fit_motion(m, still, corners, nodes, patches)
+            budget.moves[m] = (1.0 + SAFETY) * (
+                (patches.motion.shift[m] - middle).norm()
+                + patches.motion.turn[m].norm() * patches.motion.radius[m]
+                + patches.motion.rest[m]
+            )
+            budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
+            if not budget.travel[m] <= budget.reach[m]:
+                counter[2] = 1
+            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+    begin_sharing(taken, 1)
+    for worker in range(pairs_end):
+        end = ti.select(counter[2] == 0, met.count, 0)
+        p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
+        while p < end:
+            age_pair(
+                p, met, patches, budget, thickness, least_skin, astray, first_due, first_due_of_edges, needed, counter
+            )
+            p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)
+    expired = ti.select(counter[2] == 0, counter[0], -1)
+    return ti.math.ivec4(ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, counter[1])
 
 
 @func
@@ -295,11 +323,10 @@ def approach_of(m: ti.i32, other: ti.i32, motion: PatchMotion) -> ti.f32:
     )
 
 
-@kernel
-def age_pairs(
+@func
+def age_pair(
+    p: ti.i32,
     met: PatchPairArrays,
-    workers: ti.i32,
-    taken: Integers,
     patches: PatchBounds,
     budget: PatchBudget,
     thickness: ti.f32,
@@ -309,17 +336,16 @@ def age_pairs(
     first_due_of_edges: Floats,
     needed: Integers,
     counter: Integers,
-) -> ti.math.ivec2:
-    """List the pairs of patches whose elements have to be searched before this substep, and those of whose elements
-    some are due; returns how many there are.
+):
+    """List a pair of patches if its elements have to be searched before this substep, and if some of them are due.
 
     Pairs far apart sleep until their patches' motion can have closed the gap between their boxes.
 
     Args:
+        p: number of the pair.
         met: the pairs, with `slack`: how much nearer elements that are not listed may come, and be a thickness apart;
             and `left`: what of it elements that are listed may use up until they are looked at: one that was d apart
             when the slack was s is due when `left` is below s - d.
-        workers, taken: see `sim.core.scheduling`.
         patches, budget: their motion in this substep.
         thickness: the largest [m].
         least_skin: how far beyond to search at least [m].
@@ -327,45 +353,36 @@ def age_pairs(
         first_due, first_due_of_edges: the largest number that is due of a pair of patches; `NEVER` after this where it
             is due, as those that are looked at get other ones.
         needed: gets 1 for patches of pairs that are searched.
-        counter: two integers to count with.
+        counter: of both lists.
     """
-    counter[0], counter[1] = 0, 0
-    begin_sharing(taken, 0)
-    for worker in range(workers):
-        p = next_item(-1, worker, taken, 0, PAIRS_AT_A_TIME)
-        while p < met.count:
-            m, other = met.pairs[p][0], met.pairs[p][1]
-            if budget.travel[m] + budget.travel[other] > met.wake[p]:
-                whole, besides = budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other]
-                nearer = ti.min(approach_of(m, other, patches.motion), whole)
-                met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
-                met.slack[p] -= 2.0 * astray
-                is_searched = False
-                if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
-                    gap = gap_of_boxes(m, other, patches.low, patches.high) - (1.0 + SAFETY_OF_DUE) * thickness
-                    if gap > whole + besides:
-                        met.wake[p], met.slack[p] = budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0
-                        met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
-                    else:
-                        skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
-                        met.wake[p], met.slack[p], met.reach[p] = -1.0, skin, thickness + skin
-                        is_searched = True
-                        met.expired[ti.atomic_add(counter[0], 1)] = p
-                        needed[m], needed[other] = 1, 1
-                if met.wake[p] < 0.0:
-                    met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
-                    if is_searched or first_due[p] >= met.left[p] or first_due_of_edges[p] >= met.left[p]:
-                        met.due[ti.atomic_add(counter[1], 1)] = p
-                        first_due[p], first_due_of_edges[p] = NEVER, NEVER
-            p = next_item(p, worker, taken, 0, PAIRS_AT_A_TIME)
-    return ti.math.ivec2(counter[0], counter[1])
+    m, other = met.pairs[p][0], met.pairs[p][1]
+    if budget.travel[m] + budget.travel[other] > met.wake[p]:
+        whole, besides = budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other]
+        nearer = ti.min(approach_of(m, other, patches.motion), whole)
+        met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
+        met.slack[p] -= 2.0 * astray
+        is_searched = False
+        if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
+            gap = gap_of_boxes(m, other, patches.low, patches.high) - (1.0 + SAFETY_OF_DUE) * thickness
+            if gap > whole + besides:
+                met.wake[p], met.slack[p] = budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0
+                met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
+            else:
+                skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
+                met.wake[p], met.slack[p], met.reach[p] = -1.0, skin, thickness + skin
+                is_searched = True
+                met.expired[ti.atomic_add(counter[0], 1)] = p
+                needed[m], needed[other] = 1, 1
+        if met.wake[p] < 0.0:
+            met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
+            if is_searched or first_due[p] >= met.left[p] or first_due_of_edges[p] >= met.left[p]:
+                met.due[ti.atomic_add(counter[1], 1)] = p
+                first_due[p], first_due_of_edges[p] = NEVER, NEVER
 
 
-@kernel
-def measure_changes(
-    share: Share,
-    workers: ti.i32,
-    taken: Integers,
+@func
+def measure_change(
+    m: ti.i32,
     corners: PatchNodes,
     displacement: Vectors,
     predicted: Vectors,
@@ -373,87 +390,50 @@ def measure_changes(
     change: Floats,
     margin: Floats,
     more: Floats,
-    is_short: ti.template(),
-) -> ti.math.vec2:
-    """How far contacts displaced the vertices of each patch, `change` [m]; where that is beyond the `margin` that was
-    allowed for, half as much again is from now on.
-
-    Returns the largest change, and the largest that is beyond its margin, or 0.
-    """
-    begin_sharing(taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for worker in range(workers):
-        lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
-        while lane < share.tree.lanes:
-            largest, largest_beyond = 0.0, 0.0
-            for k in range(share.items):
-                m = lane * share.lane_step + k * share.item_step
-                if m < corners.count:
-                    squared = 0.0
-                    for place in range(corners.first[m], corners.first[m + 1]):
-                        i = corners.nodes[place]
-                        squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
-                    change[m] = ti.sqrt(squared)
-                    largest = ti.max(largest, change[m])
-                    if change[m] > margin[m]:
-                        largest_beyond = ti.max(largest_beyond, change[m])
-                        margin[m] = 1.5 * change[m]
-                        more[m] = margin[m] - half_thickness
-            share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, largest_beyond
-            lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
-    results = reduced(share.tree.partial, share.tree.lanes, 2, 2, share.tree.nodes)
-    return ti.math.vec2(results[0], results[1])
-
-
-@kernel
-def finish_patches(
-    vertex_count: ti.i32,
-    nodes: TrackedNodes,
-    corners: PatchNodes,
-    patches: PatchBounds,
-    budget: PatchBudget,
-    end: SubstepEnd,
-    patch_workers: ti.i32,
-    pair_workers: ti.i32,
-    taken: Integers,
-    met: PatchPairArrays,
-    is_short: ti.template(),
+    counter: Integers,
 ):
-    """The displacements of a substep are final: note where they lead, and what of the lists they use up.
+    """How far contacts displaced the vertices of a patch at most, `change` [m]; where that is beyond the `margin` that
+    was allowed for, half as much again is from now on.
 
-    Patches that contacts changed by more than `negligible` [m] are fitted anew. Margins for the next substep are
-    `WIDENED` times what contacts did in this one, and `least_margin` at least [m].
+    The second number of `counter` becomes 1 where it is beyond, and the third where it is not finite.
     """
-    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    vertices_end, patches_end, pairs_end = vertex_count, corners.count, met.count
-    first_end, second_end = patch_workers, pair_workers
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for i in range(vertices_end):
-        nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
-    begin_sharing(taken, 0)
-    for worker in range(first_end):
-        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while m < patches_end:
-            budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
-            budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
-            budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m])
-            budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
-            if budget.change[m] > end.negligible:
-                fit_motion(m, end.still, corners, nodes, patches)
-            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
-    begin_sharing(taken, 1)
-    for worker in range(second_end):
-        p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
-        while p < pairs_end:
-            if met.slack[p] > 0.0:
-                m, other = met.pairs[p][0], met.pairs[p][1]
-                nearer = met.approach[p] + budget.change[m] + budget.change[other]
-                if ti.max(budget.change[m], budget.change[other]) > end.negligible:
-                    nearer = approach_of(m, other, patches.motion)
-                    # A patch that was not fitted anew moves as noted, but for its change.
-                    nearer += ti.select(budget.change[m] > end.negligible, 0.0, budget.change[m])
-                    nearer += ti.select(budget.change[other] > end.negligible, 0.0, budget.change[other])
-                met.slack[p] -= nearer
-            p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)
+    squared = 0.0
+    for place in range(corners.first[m], corners.first[m + 1]):
+        i = corners.nodes[place]
+        squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
+    change[m] = ti.sqrt(squared)
+    if change[m] > margin[m]:
+        margin[m] = 1.5 * change[m]
+        more[m] = margin[m] - half_thickness
+        counter[1] = 1
+    if is_finite(squared) == 0:
+        counter[2] = 1
+
+
+@func
+def finish_patch(
+    m: ti.i32, nodes: TrackedNodes, corners: PatchNodes, patches: PatchBounds, budget: PatchBudget, end: SubstepEnd
+):
+    """What a patch used up of the lists in a substep. If contacts changed it by more than `negligible` [m] it is fitted
+    anew; its margin for the next substep is `WIDENED` times what they did in this one, and `least_margin` [m] at least.
+    """
+    budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
+    budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
+    budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m])
+    budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
+    if budget.change[m] > end.negligible:
+        fit_motion(m, end.still, corners, nodes, patches)
+
+
+@func
+def finish_pair(p: ti.i32, met: PatchPairArrays, patches: PatchBounds, budget: PatchBudget, negligible: ti.f32):
+    """The same of a pair of patches."""
+    if met.slack[p] > 0.0:
+        m, other = met.pairs[p][0], met.pairs[p][1]
+        nearer = met.approach[p] + budget.change[m] + budget.change[other]
+        if ti.max(budget.change[m], budget.change[other]) > negligible:
+            nearer = approach_of(m, other, patches.motion)
+            # A patch that was not fitted anew moves as noted, but for its change.
+            nearer += ti.select(budget.change[m] > negligible, 0.0, budget.change[m])
+            nearer += ti.select(budget.change[other] > negligible, 0.0, budget.change[other])
+        met.slack[p] -= nearer

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
 from sim.cloth.bundles import (
     BoxTree,
@@ -16,27 +15,25 @@ from sim.cloth.bundles import (
     PatchBudget,
     PatchMotion,
     PatchPairArrays,
-    PieceRoom,
     SubstepEnd,
     TrackedNodes,
 )
+from sim.cloth.contact_end import end_contacts
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_motion_kernels import (
-    age_pairs,
-    finish_patches,
     look_at_patches,
-    measure_changes,
     merge_boxes,
     pair_patches,
     place_leaves,
     sort_known,
 )
 from sim.cloth.patches import Patches
-from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces
-from sim.core.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
+from sim.cloth.self_collision_kernels import NEVER, carry_pieces
+from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
 
 if TYPE_CHECKING:
+    from sim.cloth.proximity_contacts import ContactList
     from sim.cloth.state import ClothState
 
 GROWTH = 1.5
@@ -69,17 +66,19 @@ class PairList:
         due: they are looked at when `PatchPairs.left` is not above it [m], (capacity,).
         pieces: first place of each piece, places, and how many of them are taken, (pairs of patches,) ivec4.
         piece_due: the largest `due` of each piece [m]; `NEVER` where nothing is listed.
-        taken: see `sim.core.scheduling`.
-        again: numbers of the pieces that `make_room` found too short.
+        capacity: places of pairs.
+        again: numbers of the pieces that were too short.
 
     Args:
         capacity: pairs of elements to start with.
         pieces: pairs of patches.
+        ends: of all lists, on the device.
+        number: of this one.
     """
 
-    def __init__(self, *, capacity: int, pieces: int) -> None:
-        self.lanes = LANES if runs_on_gpu() else 1
-        self._end, self.taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 1)
+    def __init__(self, *, capacity: int, pieces: int, ends: ti.Ndarray, number: int) -> None:
+        self._ends, self._number = ends, number
+        self._taken = ti.ndarray(ti.i32, 1)
         self._allocate(capacity)
         self.set_pieces(pieces)
 
@@ -89,18 +88,13 @@ class PairList:
         return PairPieces(self.pieces, self.piece_due, *self._listed)
 
     @property
-    def room(self) -> PieceRoom:
-        """The pieces for `make_room`."""
-        return PieceRoom(self.pieces, self._end, self.again)
-
-    @property
     def _listed(self) -> tuple[ti.Ndarray, ...]:
         return self.vertices, self.wanted, self.due
 
     def set_pieces(self, capacity: int) -> None:
         """Make room for the pieces of so many pairs of patches, all empty."""
         self.end = 0
-        self._end.fill(0)
+        self._ends.fill(0)
         self.pieces, self.piece_due, self.again = _room_for_pieces(capacity)
         self._spare_pieces = _room_for_pieces(capacity)
 
@@ -117,33 +111,38 @@ class PairList:
         pieces, listed = (self.pieces, self.piece_due, self.again), self._listed
         if self._spare_pieces[0].shape[0] < capacity:
             self._spare_pieces = _room_for_pieces(capacity)
-        if self._spare[0].shape[0] < self._capacity:
-            self._spare = _room_for_pairs(self._capacity)
+        if self._spare[0].shape[0] < self.capacity:
+            self._spare = _room_for_pairs(self.capacity)
         self.pieces, self.piece_due, self.again = self._spare_pieces
         self.vertices, self.wanted, self.due = self._spare
         self._spare_pieces, self._spare = pieces, listed
-        self.end = int(carry_pieces(count, workers_for(count), self.taken, carried, before, self.on_device, self._end))
+        self.end = int(
+            carry_pieces(
+                count, workers_for(count), self._taken, carried, before, self.on_device, self._ends, self._number
+            )
+        )
 
-    def reach_to(self, end: int) -> None:
-        """There are pieces up to this place now.
+    def reach_to(self, end: int) -> bool:
+        """Whether pieces up to this place did not fit; now there is room.
 
         Raises:
             OverflowError: more pairs than any useful step has.
         """
         if end < 0 or end > MAX_PAIRS:
             raise OverflowError(TOO_MANY)
-        if end > self._capacity:
+        self.end, fits = end, end <= self.capacity
+        if not fits:
             self._grow(int(GROWTH * end))
-        self.end = end
+        return not fits
 
     def _allocate(self, capacity: int) -> None:
-        self._capacity = capacity
+        self.capacity = capacity
         self.vertices, self.wanted, self.due = _room_for_pairs(capacity)
         self._spare = _room_for_pairs(1)
 
     def _grow(self, capacity: int) -> None:
         """Make room for so many pairs, and keep those that are listed: when lists grow shows in no search after it."""
-        old, before = self._capacity, self._listed
+        old, before = self.capacity, self._listed
         self._allocate(capacity)
         for source, target in zip(before, self._listed, strict=True):
             values = source.to_numpy()
@@ -196,13 +195,13 @@ class PatchPairs:
         self._budget = PatchBudget(*(ti.ndarray(ti.f32, m) for _ in PatchBudget._fields))
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree = BoxTree(patches.leaves, *(ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2)))
-        self._counter, self._taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 2)
+        self._counter, self._taken = (ti.ndarray(ti.i32, 3) for _ in range(2))
         self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
         self.needed.fill(0)
-        self._maxima = LaneReduction(maxima=MAX_QUANTITIES, sums=0)
+        self._maxima = LaneReduction(maxima=7, sums=0)
         self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
-        self.count = self.due_count = 0
+        self.count = self.due_count = self.expired_count = 0
         self._is_short = is_short(patches.vertex_count, NODE_NS)
         self._allocate(8 * m)
 
@@ -240,27 +239,17 @@ class PatchPairs:
         self._budget.margin.fill(MARGIN * thickness)
         self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
-    def look(self, state: ClothState) -> tuple[NDArray[np.float64], bool]:
+    def look(self, state: ClothState, *age: float | ti.Ndarray) -> tuple[float, bool]:
         """Note where patches are and how they move in this substep.
 
-        Returns the largest components of the displacements [m], then those of their negatives, (6,); and whether the
-        pairs of patches hold for this substep, if they held before.
+        Returns how far vertices get apart from their common motion [m]; and whether the pairs of patches hold for this
+        substep, if they held before. If they are to be aged then, they have been.
+
+        Args:
+            state: at the start of the substep.
+            age: as `age` takes them, if the pairs held before.
         """
-        patches, n = self.patches, self.patches.vertex_count
-        *ends, self._astray, beyond = look_at_patches(
-            n,
-            self._tracked(state),
-            self._maxima.over(n),
-            self._maxima.over(patches.count),
-            self._still,
-            patches.corner_lists,
-            self.bounds,
-            self._budget,
-            workers_for(self._maxima.lanes.count),
-            self._taken,
-            self._is_short,
-        )
-        return np.array(ends, dtype=np.float64), beyond <= 0.0
+        return self._look(state, self.patches.vertex_count, *age)
 
     def meet(self, thickness: float, edge: float, collides: ti.Ndarray, *, keeps: bool = False) -> bool:
         """List the pairs of patches that may get within a thickness [m].
@@ -318,78 +307,86 @@ class PatchPairs:
         self.count = int(found)
         return keeps
 
-    def age(self, thickness: float, least_skin: float, *first_due: ti.Ndarray) -> int:
+    def age(self, state: ClothState, thickness: float, least_skin: float, *first_due: ti.Ndarray) -> int:
         """Find which pairs have to be searched in this substep, and how far each; returns how many there are.
 
         Args:
+            state: at the start of the substep.
             thickness: distance within which all elements have to be listed [m].
             least_skin: how far beyond to search at least [m].
             first_due: `PairList.piece_due` of both lists; `NEVER` after this where a pair is due.
         """
-        expired, due = age_pairs(
-            self.on_device,
-            workers_for(self.count),
-            self._taken,
+        self._look(state, 0, thickness, least_skin, *first_due)
+        return self.expired_count
+
+    def _look(self, state: ClothState, vertex_count: int, *age: float | ti.Ndarray) -> tuple[float, bool]:
+        """Look at the patches unless there are no vertices, then age the pairs unless nothing is said about that."""
+        patches = self.patches
+        motion, astray, expired, due = look_at_patches(
+            vertex_count,
+            self._tracked(state),
+            self._maxima.over(vertex_count),
+            self._still,
+            patches.corner_lists,
             self.bounds,
             self._budget,
-            thickness,
-            least_skin,
+            workers_for(patches.count) if vertex_count else 0,
             self._astray,
-            *first_due,
+            self.on_device,
+            workers_for(self.count) if age else 0,
+            *(age or (0.0, 0.0, self.left, self.left)),
             self.needed,
             self._counter,
-        )[:2]
-        self.due_count = int(due)
-        return int(expired)
-
-    def measure_changes(self, state: ClothState, predicted: ti.Ndarray) -> tuple[float, float]:
-        """How far contacts displaced vertices at most [m]; and those that they displaced farther than allowed for.
-
-        Where they did, they may displace half as much again from now on.
-        """
-        patches, budget = self.patches, self._budget
-        largest, beyond = measure_changes(
-            self._maxima.over(patches.count),
-            workers_for(self._maxima.lanes.count),
             self._taken,
-            patches.corner_lists,
-            state.displacement,
-            predicted,
-            self._half_thickness,
-            budget.change,
-            budget.margin,
-            budget.more,
             self._is_short,
         )
-        return float(largest), float(beyond)
+        if vertex_count:
+            self._astray = float(np.int32(astray).view(np.float32))
+        self.expired_count, self.due_count = max(int(expired), 0), int(due)
+        return float(np.int32(motion).view(np.float32)), expired >= 0
 
-    def finish(self, state: ClothState, negligible: float, *, is_changed: bool) -> None:
-        """A substep is over: its motion is used up, and what contacts added to it, if they did.
+    def finish(
+        self,
+        state: ClothState,
+        predicted: ti.Ndarray,
+        contacts: ContactList,
+        count: int,
+        negligible: float,
+        *,
+        is_changed: bool,
+    ) -> list[int]:
+        """Test contacts, and if all is well the substep is over: its motion is used up, and what contacts added to it.
+
+        Where they displaced patches farther than allowed for, they may displace these half as far again from now on.
+        Returns what `end_contacts` does.
 
         Args:
             state: at the end of its displacements.
-            negligible: what they may add without the motion of patches being looked at anew [m].
-            is_changed: whether `measure_changes` was asked in this substep.
+            predicted: displacements without contacts.
+            contacts: in the substep.
+            count: of those that are tested.
+            negligible: what contacts may add without the motion of patches being looked at anew [m].
+            is_changed: whether contacts changed displacements.
         """
-        patches = self.patches
-        end = SubstepEnd(
-            is_changed=int(is_changed),
-            astray=self._astray,
-            still=self._still,
-            negligible=negligible,
-            least_margin=MARGIN * 2.0 * self._half_thickness,
-            half_thickness=self._half_thickness,
-        )
-        finish_patches(
+        patches, half = self.patches, self._half_thickness
+        found: list[int] = end_contacts(
+            count,
+            contacts.found,
+            contacts.impulse,
+            state.inverse_mass,
+            state.thickness,
+            contacts.crossing,
             patches.vertex_count,
             self._tracked(state),
+            predicted,
             patches.corner_lists,
             self.bounds,
             self._budget,
-            end,
-            workers_for(patches.count),
-            workers_for(self.count),
-            self._taken,
+            SubstepEnd(int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
             self.on_device,
+            (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
+            self._taken,
+            self._counter,
             self._is_short,
         )
+        return found

@@ -3,8 +3,6 @@
 import taichi as ti
 
 from sim.cloth.bundles import Contacts, Impulses
-from sim.core.arrays import Integers
-from sim.core.launch import kernel
 
 VERTEX_TRIANGLE, EDGE_EDGE, WALL = -1, -2, -3
 """What a contact is between; from 0 on it is the number of the body that the cloth touches."""
@@ -34,19 +32,16 @@ class ContactList:
         impulse_before, impulse_given: that of an iteration earlier, and that which displacements contain already.
         pushing: numbers of the contacts that push, (capacity,); `push` is what they give in a step of the iteration, in
             its units, in the same order.
+        crossing: whether pairs may have crossed, (capacity,).
         used_by, use_weight: places of contacts in that order, and weights, vertex by vertex, (4 capacity,).
         found: what finding contacts writes, for kernels.
-        counter: number of contacts found, also those beyond the capacity, (1,).
+        counter: number of contacts found, also those beyond the capacity; ends that lists of pairs need, (3,).
     """
 
     def __init__(self, capacity: int) -> None:
-        self.counter = ti.ndarray(ti.i32, 1)
+        self.counter = ti.ndarray(ti.i32, 3)
         self.counter.fill(0)
         self._allocate(capacity)
-
-    def take_found(self) -> int:
-        """Number of contacts found, also those beyond the capacity; none are from now on. Waits for the device."""
-        return int(take_count(self.counter))
 
     def make_room_for(self, found: int) -> bool:
         """Whether so many contacts did not fit, so that they have to be found again; now there is room."""
@@ -82,7 +77,7 @@ class ContactList:
         self.impulse, self.impulse_before, self.impulse_given = (
             ti.Vector.ndarray(3, ti.f32, self.capacity) for _ in range(3)
         )
-        self.pushing = ti.ndarray(ti.i32, self.capacity)
+        self.pushing, self.crossing = (ti.ndarray(ti.i32, self.capacity) for _ in range(2))
         self.push = ti.Vector.ndarray(3, ti.f32, self.capacity)
         self.used_by, self.use_weight = ti.ndarray(ti.i32, 4 * self.capacity), ti.ndarray(ti.f32, 4 * self.capacity)
         self.found = Contacts(
@@ -96,14 +91,6 @@ class ContactList:
             counter=self.counter,
             capacity=self.capacity,
         )
-
-
-@kernel
-def take_count(counter: Integers) -> ti.i32:
-    """The first of some integers, which is zero then."""
-    count = counter[0]
-    counter[0] = 0
-    return count
 
 
 @ti.func

@@ -19,19 +19,17 @@ from sim.cloth.bundles import (
     Three,
     Walls,
 )
-from sim.cloth.loop_costs import PATCH_AT_WALLS_NS
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
-from sim.cloth.self_collision_kernels import LANES
+from sim.cloth.self_collision_kernels import lanes_of_pair
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.motion.paths import Poses
-from sim.core.reductions import runs_on_gpu
-from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
+from sim.core.scheduling import begin_sharing, next_item, workers_for
 from sim.core.walls import Wall
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.device_shapes import GRID, SPHERE, TORUS, Shapes, distance_to
@@ -111,7 +109,7 @@ class RigidContact:
         self._spin_speed = np.zeros(len(geometries))
         self._shows = np.zeros(len(geometries), dtype=bool)
         self._spacing, self._longest, self._largest_half = 0.0, 0.0, 0.0
-        self._taken = ti.ndarray(ti.i32, 1)
+        self._taken = ti.ndarray(ti.i32, 2)
         room = max(len(walls), 1)
         corners = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(4))
         self._walls = Walls(len(walls), ti.Vector.ndarray(4, ti.f32, room), *corners)
@@ -197,8 +195,9 @@ class RigidContact:
         motion: PatchMotion,
         contacts: ContactList,
         recovery: float,
-    ) -> None:
-        """Append what touches in this substep.
+    ) -> list[int]:
+        """Append what touches in this substep. Returns the numbers of the list's counter, the first of which is how
+        many contacts were found in all; that is 0 from then on. Waits for the device.
 
         Args:
             state: at the start of a substep.
@@ -207,91 +206,37 @@ class RigidContact:
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
-        lanes = LANES if runs_on_gpu() else 1
-        if self._walls.count:
-            find_wall_contacts(
-                patches.vertex_lists,
-                lanes,
-                motion,
-                self._largest_half,
-                state.surface,
-                self._walls,
-                self._spacing,
-                recovery,
-                contacts.found,
-                is_short(patches.count, PATCH_AT_WALLS_NS),
-            )
-        if not self.bodies.count:
-            return
-        workers, bodies = workers_for(patches.count * lanes), self.bodies.colliding
-        find_body_contacts_of_vertices(
+        lanes = lanes_of_pair()
+        found: list[int] = find_rigid_contacts(
             patches.vertex_lists,
+            patches.elements,
             lanes,
-            workers,
+            workers_for(patches.count * lanes) if self._walls.count or self.bodies.count else 0,
             self._taken,
             motion,
             self._largest_half,
             state.surface,
             state.inverse_mass,
-            bodies,
+            self._walls,
+            self._spacing,
+            self.bodies.colliding,
             recovery,
             contacts.found,
+            self.bodies.count > 0,
+            bool(self._shows.any()),
         )
-        if self._shows.any():
-            find_body_contacts_of_triangles(
-                patches.elements,
-                lanes,
-                workers,
-                self._taken,
-                motion,
-                self._largest_half,
-                state.surface,
-                state.inverse_mass,
-                bodies,
-                recovery,
-                contacts.found,
-            )
-
-
-@kernel
-def find_wall_contacts(
-    listed: PatchNodes,
-    lanes: ti.i32,
-    motion: PatchMotion,
-    largest_half: ti.f32,
-    surface: Surface,
-    walls: Walls,
-    spacing: ti.f32,
-    recovery: ti.f32,
-    contacts: Contacts,
-    is_short: ti.template(),
-):
-    """Append the vertices that reach a wall, of the patches that may; walls are flat, so that vertices are enough.
-
-    Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
-    both.
-    """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for item in range(listed.count * lanes):
-        m = item // lanes
-        reach = (
-            motion.shift[m].norm() + (1.0 + motion.turn[m].norm()) * motion.radius[m] + motion.rest[m] + largest_half
-        )
-        for w in range(walls.count):
-            is_near = walls.plane[w].xyz.dot(motion.centre[m]) - walls.plane[w].w < WITH_ROUNDING * reach
-            place = ti.select(is_near, listed.first[m], listed.first[m + 1])
-            place += item % lanes
-            while place < listed.first[m + 1]:
-                touch_wall(listed.nodes[place], w, surface, walls, spacing, recovery, contacts)
-                place += lanes
+        return found
 
 
 @func
 def touch_wall(
     i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, spacing: ti.f32, recovery: ti.f32, contacts: Contacts
 ):
-    """Append a vertex if it reaches a wall."""
+    """Append a vertex if it reaches a wall.
+
+    Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
+    both.
+    """
     x, half, n = surface.position[i], 0.5 * surface.thickness[i], walls.plane[w].xyz
     distance = n.dot(x) - walls.plane[w].w
     least = least_displacement(distance, half, recovery)
@@ -401,54 +346,8 @@ def deepest_on_triangle(y: Corners, in_middle: ti.f32, b: ti.i32, shapes: Shapes
 
 
 @kernel
-def find_body_contacts_of_vertices(
+def find_rigid_contacts(
     listed: PatchNodes,
-    lanes: ti.i32,
-    workers: ti.i32,
-    taken: Integers,
-    motion: PatchMotion,
-    largest_half: ti.f32,
-    surface: Surface,
-    inverse_mass: Floats,
-    bodies: CollidingBodies,
-    recovery: ti.f32,
-    contacts: Contacts,
-):
-    """Append the contacts of vertices with bodies.
-
-    Parallel however few there are: compiled twice, normals would be rounded differently.
-    """
-    begin_sharing(taken, 0)
-    for worker in range(workers):
-        item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while item < listed.count * lanes:
-            m = item // lanes
-            may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-            place = ti.select(may_touch == 1, listed.first[m], listed.first[m + 1]) + item % lanes
-            while place < listed.first[m + 1]:
-                i = listed.nodes[place]
-                for b in range(bodies.count):
-                    touch_body(
-                        b,
-                        surface.position[i],
-                        surface.displacement[i],
-                        0.5 * surface.thickness[i],
-                        surface.friction[i],
-                        Four(i),
-                        ti.math.vec4(1.0, 0.0, 0.0, 0.0),
-                        True,
-                        ti.Matrix.identity(ti.f32, 3),
-                        ti.select(inverse_mass[i] > 0.0, 0.5 * surface.thickness[i], 0.0),
-                        recovery,
-                        bodies,
-                        contacts,
-                    )
-                place += lanes
-            item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
-
-
-@kernel
-def find_body_contacts_of_triangles(
     elements: PatchElements,
     lanes: ti.i32,
     workers: ti.i32,
@@ -457,33 +356,84 @@ def find_body_contacts_of_triangles(
     largest_half: ti.f32,
     surface: Surface,
     inverse_mass: Floats,
+    walls: Walls,
+    spacing: ti.f32,
     bodies: CollidingBodies,
     recovery: ti.f32,
     contacts: Contacts,
-):
-    """Append the contacts of triangles, each at its deepest point, with bodies that may show between vertices."""
+    are_there: ti.template(),
+    show: ti.template(),
+) -> ti.math.ivec3:
+    """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if bodies `are_there`,
+    also with these, and if some `show` between vertices, those of triangles, each at its deepest point.
+
+    Parallel however few there are: compiled twice, normals would be rounded differently. Returns the numbers of the
+    list's counter, whose first is 0 then.
+    """
+    workers_end = workers
     begin_sharing(taken, 0)
-    for worker in range(workers):
+    for worker in range(workers_end):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while item < elements.count * lanes:
+        while item < listed.count * lanes:
             m = item // lanes
-            may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-            # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
-            edges = elements.first_edge[m + 1] - elements.first_edge[m]
-            end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
-            place = ti.select(may_touch == 1, item % lanes, end)
-            while place < end:
-                corners = Three(0)
-                if place < edges:
-                    ends = elements.edges[elements.first_edge[m] + place]
-                    corners = Three(ends[0], ends[1], ends[1])
-                else:
-                    corners = elements.triangles[elements.first_triangle[m] + place - edges]
-                for b in range(bodies.count):
-                    if bodies.shows[b] > ti.cast(place < edges, ti.i32):
-                        touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)
-                place += lanes
+            reach = motion.shift[m].norm() + (1.0 + motion.turn[m].norm()) * motion.radius[m] + motion.rest[m]
+            for w in range(walls.count):
+                above = walls.plane[w].xyz.dot(motion.centre[m]) - walls.plane[w].w
+                is_near = above < WITH_ROUNDING * (reach + largest_half)
+                place = ti.select(is_near, listed.first[m], listed.first[m + 1]) + item % lanes
+                while place < listed.first[m + 1]:
+                    touch_wall(listed.nodes[place], w, surface, walls, spacing, recovery, contacts)
+                    place += lanes
+            if ti.static(are_there):
+                may_touch = may_touch_bodies(m, motion, largest_half, bodies)
+                place = ti.select(may_touch == 1, listed.first[m], listed.first[m + 1]) + item % lanes
+                while place < listed.first[m + 1]:
+                    i = listed.nodes[place]
+                    half = 0.5 * surface.thickness[i]
+                    for b in range(bodies.count):
+                        touch_body(
+                            b,
+                            surface.position[i],
+                            surface.displacement[i],
+                            half,
+                            surface.friction[i],
+                            Four(i),
+                            ti.math.vec4(1.0, 0.0, 0.0, 0.0),
+                            True,
+                            ti.Matrix.identity(ti.f32, 3),
+                            ti.select(inverse_mass[i] > 0.0, half, 0.0),
+                            recovery,
+                            bodies,
+                            contacts,
+                        )
+                    place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
+    if ti.static(show):
+        begin_sharing(taken, 1)
+        for worker in range(workers_end):
+            item = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
+            while item < elements.count * lanes:
+                m = item // lanes
+                may_touch = may_touch_bodies(m, motion, largest_half, bodies)
+                # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
+                edges = elements.first_edge[m + 1] - elements.first_edge[m]
+                end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
+                place = ti.select(may_touch == 1, item % lanes, end)
+                while place < end:
+                    corners = Three(0)
+                    if place < edges:
+                        ends = elements.edges[elements.first_edge[m] + place]
+                        corners = Three(ends[0], ends[1], ends[1])
+                    else:
+                        corners = elements.triangles[elements.first_triangle[m] + place - edges]
+                    for b in range(bodies.count):
+                        if bodies.shows[b] > ti.cast(place < edges, ti.i32):
+                            touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)
+                    place += lanes
+                item = next_item(item, worker, taken, 1, PATCHES_AT_A_TIME)
+    found = ti.math.ivec3(contacts.counter[0], contacts.counter[1], contacts.counter[2])
+    contacts.counter[0] = 0
+    return found
 
 
 @func

@@ -63,7 +63,7 @@ class RectangleAir:
 
 @func
 def force_on_triangle(x_a, x_b, x_c, mean, free, wind: Wind, gravity, dt: ti.f32) -> ti.math.vec3:
-    """`blow_on_triangles` without branches, for air that is given; `mean` is the velocity of the nodes."""
+    """`predict_in_air` without branches, for air that is given; `mean` is the velocity of the nodes."""
     cross = (x_b - x_a).cross(x_c - x_a)
     squared = cross.dot(cross)
     inverse = 1.0 / ti.sqrt(ti.max(squared, LEAST_SQUARE))

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import PatchMotion, Searches
+from sim.cloth.bundles import PatchMotion
 from sim.cloth.element_blocks import ElementBlocks
 from sim.cloth.loop_costs import NODE_NS
+from sim.cloth.near_pairs import find_near_pairs
 from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
-from sim.cloth.self_collision_kernels import find_near_pairs, make_room, range_of_vectors, search_patches
+from sim.cloth.self_collision_kernels import lanes_of_pair, range_of_vectors
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
@@ -61,8 +63,11 @@ class SelfCollision:
         self._rest.from_numpy(state.host.position.astype(np.float32))
         self._blocks = ElementBlocks(self._patches)
         self._collides = ti.ndarray(ti.i32, len(state.names))
-        self.with_triangles = PairList(capacity=state.vertex_count, pieces=self._met.capacity)
-        self.of_edges = PairList(capacity=state.edge_count, pieces=self._met.capacity)
+        self._ends, self._taken = ti.ndarray(ti.i32, 4), ti.ndarray(ti.i32, 4)
+        self.with_triangles, self.of_edges = (
+            PairList(capacity=capacity, pieces=self._met.capacity, ends=self._ends, number=number)
+            for number, capacity in enumerate((state.vertex_count, state.edge_count))
+        )
         edges = state.host.position[state.host.edges]
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
         self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
@@ -70,11 +75,11 @@ class SelfCollision:
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
         self.thickness = 0.0
         self._listed_for: tuple[bytes, tuple[bool, ...]] = (b"", ())
-        self._is_forgotten, self._is_outrun = True, False
+        self._is_forgotten, self._is_outrun, self._lacks_room = True, False, False
         self.begin_frame(state)
 
     def forget(self) -> None:
-        """Search anew at the next `prepare`."""
+        """Search anew at the next `find`."""
         self._is_forgotten = True
 
     def begin_frame(self, state: ClothState) -> None:
@@ -99,72 +104,88 @@ class SelfCollision:
 
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
-        ends, holds = self._met.look(state)
+        motion, holds = self._met.look(state, *(() if self._is_forgotten or self._is_outrun else self._age))
         self._is_outrun |= not holds
-        return float(0.5 * np.linalg.norm(ends[:3] + ends[3:]))
+        return motion
+
+    @property
+    def _age(self) -> tuple[float, float, ti.Ndarray, ti.Ndarray]:
+        """As `PatchPairs.age` takes it."""
+        edge = self.mean_edge
+        least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
+        return self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due
 
     def warm_up(self) -> None:
         """Compile what carries lists over."""
         self.with_triangles.carry(0, self._met.carried, self._met.capacity)
 
-    def prepare(self, state: ClothState) -> None:
-        """Have all pairs listed that vertices can bring within their thickness, or together, in this substep.
-
-        After `look`. Pairs that are not listed come no nearer than a thickness without contacts, and do not meet where
-        these displace vertices within their margins.
-        """
-        met, edge = self._met, self.mean_edge
-        if self._is_forgotten or self._is_outrun:
-            keeps = met.meet(self.thickness, edge, self._collides, keeps=not self._is_forgotten)
-            for pairs in (self.with_triangles, self.of_edges):
-                if keeps:
-                    pairs.carry(met.count, met.carried, met.capacity)
-                else:
-                    pairs.set_pieces(met.capacity)
-            self._is_forgotten = self._is_outrun = False
-        least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        count = met.age(self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due)
-        if count:
-            self._search(state, count)
-
-    def follow(self, state: ClothState, *, is_changed: bool) -> None:
-        """A substep is over.
-
-        Args:
-            state: at the end of its displacements.
-            is_changed: whether `measure_changes` was asked in this substep.
-        """
-        self._met.finish(state, NEGLIGIBLE * self.thickness, is_changed=is_changed)
-
-    def measure_changes(self, state: ClothState, predicted: ti.Ndarray) -> tuple[float, float]:
-        """How far contacts displaced vertices at most [m]; and those that they displaced farther than allowed for."""
-        return self._met.measure_changes(state, predicted)
+    def finish(
+        self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
+    ) -> list[int]:
+        """See `PatchPairs.finish`."""
+        negligible = NEGLIGIBLE * self.thickness
+        return self._met.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
-        """Append the listed pairs that are too near, get there, or might cross.
+        """Append the pairs that are too near, get there, or might cross; after `look`.
+
+        All pairs are listed first that vertices can bring within their thickness, or together, in this substep. Pairs
+        that are not listed come no nearer than a thickness without contacts, and do not meet where these displace
+        vertices within their margins.
 
         Args:
             state: in a substep.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
-        met = self._met
-        if met.due_count:
-            count, lanes = met.due_count, self.with_triangles.lanes
-            find_near_pairs(
-                count,
-                lanes,
-                workers_for(2 * count * lanes),
-                self.with_triangles.taken,
-                met.on_device,
-                self.with_triangles.on_device,
-                self.of_edges.on_device,
-                state.surface,
-                state.body,
-                self._rest,
-                recovery,
-                contacts.found,
-            )
+        met, lists = self._met, (self.with_triangles, self.of_edges)
+        if self._is_forgotten or self._is_outrun:
+            keeps = met.meet(self.thickness, self.mean_edge, self._collides, keeps=not self._is_forgotten)
+            for pairs in lists:
+                if keeps:
+                    pairs.carry(met.count, met.carried, met.capacity)
+                else:
+                    pairs.set_pieces(met.capacity)
+            self._is_forgotten = self._is_outrun = False
+            met.age(state, *self._age)
+        count, lanes, patches = met.expired_count, lanes_of_pair(), self._patches
+        met.expired_count, self._searched = 0, self._searched + count
+        if not (count or met.due_count or self._lacks_room):
+            return
+        find_near_pairs(
+            (count, met.due_count, *(pairs.capacity for pairs in lists)),
+            (
+                workers_for(patches.count + count) if count else 0,
+                workers_for(2 * count * lanes) if count or self._lacks_room else 0,
+                workers_for(2 * met.due_count * lanes),
+            ),
+            self._taken,
+            met.on_device,
+            met.needed,
+            met.bounds.low,
+            met.bounds.high,
+            patches.vertex_lists,
+            self._blocks.triangles,
+            self._blocks.edges,
+            *(pairs.on_device for pairs in lists),
+            *(pairs.again for pairs in lists),
+            self._ends,
+            state.surface,
+            state.body,
+            self._rest,
+            recovery,
+            contacts.found,
+        )
+
+    def make_room_for(self, ends: Sequence[int]) -> bool:
+        """Whether the lists were too short for what was searched, so that `find` has to go on; now there is room.
+
+        Args:
+            ends: that they need, as `find` left them in the list of contacts.
+        """
+        lists = (self.with_triangles, self.of_edges)
+        self._lacks_room = True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
+        return self._lacks_room
 
     @property
     def motion(self) -> PatchMotion:
@@ -180,41 +201,6 @@ class SelfCollision:
     def patch_pairs(self) -> PatchPairs:
         """Which patches may meet, where they are, and how they move."""
         return self._met
-
-    def _search(self, state: ClothState, count: int) -> None:
-        """Search the pairs of patches that have to be."""
-        met = self._met
-        self._searched += count
-        self._blocks.enclose(state, met.expired, count, self.with_triangles.pieces, self.of_edges.pieces, met.needed)
-        self._list(state, count, met.expired, count, met.expired)
-        short, end, short_edges, end_of_edges = make_room(
-            count, met.expired, self.with_triangles.room, self.of_edges.room
-        )
-        self.with_triangles.reach_to(int(end))
-        self.of_edges.reach_to(int(end_of_edges))
-        if short or short_edges:
-            self._list(state, int(short), self.with_triangles.again, int(short_edges), self.of_edges.again)
-
-    def _list(
-        self, state: ClothState, count: int, searched: ti.Ndarray, edge_count: int, edge_searched: ti.Ndarray
-    ) -> None:
-        """List the elements of some pairs of patches in empty pieces, vertices and edges; all other pieces stay."""
-        met, patches, lanes = self._met, self._patches, self.with_triangles.lanes
-        searches = Searches(count, searched, edge_count, edge_searched, lanes)
-        search_patches(
-            searches,
-            workers_for((count + edge_count) * lanes),
-            self.with_triangles.taken,
-            met.on_device,
-            met.bounds.low,
-            met.bounds.high,
-            state.position,
-            patches.vertex_lists,
-            self._blocks.triangles,
-            self._blocks.edges,
-            self.with_triangles.on_device,
-            self.of_edges.on_device,
-        )
 
 
 def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Box:

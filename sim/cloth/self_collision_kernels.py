@@ -9,9 +9,7 @@ from sim.cloth.bundles import (
     PairPieces,
     PatchNodes,
     PatchPairArrays,
-    PieceRoom,
     Quadruples,
-    Searches,
     Surface,
     TriangleBlocks,
     Two,
@@ -38,6 +36,12 @@ END_OF_EDGE = 1.0e-3
 LANES = 8
 """Threads of a GPU that search a pair of patches: enough to share out the work of a few of them."""
 
+
+def lanes_of_pair() -> int:
+    """Threads that share the work of a pair of patches."""
+    return LANES if runs_on_gpu() else 1
+
+
 BLOCK = 16
 """Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""
 
@@ -47,8 +51,8 @@ FAR = 1.0e9
 NONE = -1
 """In the place of a vertex: the block has no element there."""
 
-SEARCHED_AT_A_TIME, DUE_AT_A_TIME, CARRIED_AT_A_TIME = 1, 4, 64
-"""Pairs of patches that a thread takes at a time: some microseconds of work."""
+CARRIED_AT_A_TIME = 64
+"""Pairs of patches that a thread takes at a time, as they are carried over: some microseconds of work."""
 
 UNKNOWN = -1.0
 """Distance that a pair keeps where nobody has asked for it yet [m]."""
@@ -81,64 +85,6 @@ def lowest_bit(bits: ti.i32) -> ti.i32:
     return (ti.bit_cast(ti.cast(bits & -bits, ti.f32), ti.i32) >> 23) - 127
 
 
-@kernel
-def search_patches(
-    searches: Searches,
-    workers: ti.i32,
-    taken: Integers,
-    met: PatchPairArrays,
-    low: Vectors,
-    high: Vectors,
-    position: Vectors,
-    vertices: PatchNodes,
-    blocks: TriangleBlocks,
-    edge_blocks: EdgeBlocks,
-    found: PairPieces,
-    found_edges: PairPieces,
-):
-    """List the vertices of each of two patches with the triangles of the other within `reach` [m] of them, and the
-    edges of both within that of each other.
-
-    Args:
-        searches: which pairs of patches.
-        workers, taken: see `sim.core.scheduling`.
-        met: all pairs of patches.
-        low, high: boxes of the patches [m].
-        position: of all nodes [m].
-        vertices, blocks, edge_blocks: elements of the patches.
-        found, found_edges: lists of vertices with triangles, and of edges.
-    """
-    begin_sharing(taken, 0)
-    for worker in range(workers):
-        item = next_item(-1, worker, taken, 0, SEARCHED_AT_A_TIME)
-        while item < (searches.count + searches.edge_count) * searches.lanes:
-            if item < searches.count * searches.lanes:
-                pair_vertices_with_triangles(
-                    searches.numbers[item // searches.lanes],
-                    item % searches.lanes,
-                    searches.lanes,
-                    met,
-                    low,
-                    high,
-                    position,
-                    vertices,
-                    blocks,
-                    found,
-                )
-            else:
-                pair_edges(
-                    searches.edge_numbers[item // searches.lanes - searches.count],
-                    item % searches.lanes,
-                    searches.lanes,
-                    met,
-                    low,
-                    high,
-                    edge_blocks,
-                    found_edges,
-                )
-            item = next_item(item, worker, taken, 0, SEARCHED_AT_A_TIME)
-
-
 @func
 def pair_vertices_with_triangles(
     p: ti.i32,
@@ -147,7 +93,7 @@ def pair_vertices_with_triangles(
     met: PatchPairArrays,
     low: Vectors,
     high: Vectors,
-    position: Vectors,
+    surface: Surface,
     vertices: PatchNodes,
     blocks: TriangleBlocks,
     found: PairPieces,
@@ -163,7 +109,7 @@ def pair_vertices_with_triangles(
         while place < vertices.first[m + 1]:
             v = vertices.nodes[place]
             place += lanes
-            x = position[v]
+            x = surface.position[v]
             if (x >= least).all() and (x <= most).all():
                 below, above = x - met.reach[p], x + met.reach[p]
                 for block in range(blocks.first_block[other], blocks.first_block[other + 1]):
@@ -180,8 +126,8 @@ def pair_vertices_with_triangles(
                         corners = blocks.triangles[t]
                         own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
                         if own == 0:
-                            a, b = position[corners[0]] - x, position[corners[1]] - x
-                            c = position[corners[2]] - x
+                            a, b = surface.position[corners[0]] - x, surface.position[corners[1]] - x
+                            c = surface.position[corners[2]] - x
                             apart = distance_to_triangle(ti.math.vec3(0.0), a, b, c)
                             if apart < met.reach[p]:
                                 slot = ti.atomic_add(found.pieces[p][2], 1)
@@ -257,31 +203,14 @@ def pair_edges(
     ti.atomic_max(found.piece_due[p], soonest)
 
 
-@kernel
-def make_room(count: ti.i32, searched: Integers, room: PieceRoom, edge_room: PieceRoom) -> ti.math.ivec4:
-    """After a search: pieces that were too short move to the end, empty.
-
-    Returns how many of these there are, and where the end is now, of both lists. Their numbers are `again`; `end` has
-    the end, then how many there are.
-    """
-    searched_end = count
-    room.end[1], edge_room.end[1] = 0, 0
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for k in range(searched_end):
-        lengthen(searched[k], room)
-        lengthen(searched[k], edge_room)
-    return ti.math.ivec4(room.end[1], room.end[0], edge_room.end[1], edge_room.end[0])
-
-
 @func
-def lengthen(p: ti.i32, room: PieceRoom):
-    """Move a piece to the end if more was found than it has room for."""
-    found = room.pieces[p][2]
-    if found > room.pieces[p][1]:
+def lengthen(p: ti.i32, pieces: Quadruples, again: Integers, ends: Integers, number: ti.template()):
+    """Move a piece to the end of its list, empty, if more was found than it has room for; it is searched `again`."""
+    found = pieces[p][2]
+    if found > pieces[p][1]:
         places = found + found // 2
-        room.pieces[p] = Four(ti.atomic_add(room.end[0], places), places, 0, 0)
-        room.again[ti.atomic_add(room.end[1], 1)] = p
+        pieces[p] = Four(ti.atomic_add(ends[number], places), places, 0, 0)
+        again[ti.atomic_add(ends[2 + number], 1)] = p
 
 
 @kernel
@@ -292,14 +221,15 @@ def carry_pieces(
     carried: Integers,
     before: PairPieces,
     now: PairPieces,
-    end: Integers,
+    ends: Integers,
+    number: ti.i32,
 ) -> ti.i32:
     """Pieces of the pairs of patches that were listed before, at the places of their numbers now; returns the end.
 
     Args:
         carried: numbers that pairs of patches had before, or -1.
     """
-    end[0] = 0
+    ends[number] = 0
     begin_sharing(taken, 0)
     for worker in range(workers):
         p = next_item(-1, worker, taken, 0, CARRIED_AT_A_TIME)
@@ -307,80 +237,13 @@ def carry_pieces(
             now.pieces[p], now.piece_due[p] = Four(0), NEVER
             if carried[p] >= 0:
                 first, found = before.pieces[carried[p]][0], before.pieces[carried[p]][2]
-                start = ti.atomic_add(end[0], found)
+                start = ti.atomic_add(ends[number], found)
                 now.pieces[p], now.piece_due[p] = Four(start, found, found, 0), before.piece_due[carried[p]]
                 for k in range(found):
                     now.pairs[start + k] = before.pairs[first + k]
                     now.wanted[start + k], now.due[start + k] = before.wanted[first + k], before.due[first + k]
             p = next_item(p, worker, taken, 0, CARRIED_AT_A_TIME)
-    return end[0]
-
-
-@kernel
-def find_near_pairs(
-    count: ti.i32,
-    lanes: ti.i32,
-    workers: ti.i32,
-    taken: Integers,
-    met: PatchPairArrays,
-    listed: PairPieces,
-    listed_edges: PairPieces,
-    surface: Surface,
-    cloth: Integers,
-    rest: Vectors,
-    recovery: ti.f32,
-    contacts: Contacts,
-):
-    """Append the pairs that are nearer than they shall be, or get there, and those that might cross.
-
-    The displacement along the line of shortest distance counts. A pair might cross when its vertices, displaced as
-    they are now and by contacts besides, come together: then it is watched, `INACTIVE`. They come no nearer than by
-    twice their motion against their mean, nor than by the `approach` [m] of their patches; contacts are `allowed` so
-    much more [m]. Pairs that have been farther off than their patches have approached since are not even looked at.
-
-    Args:
-        count: of the pairs of patches that are due; `lanes` threads share one.
-        workers, taken: see `sim.core.scheduling`; twice as many items: a pair's vertices and its edges.
-        met: all pairs of patches.
-        listed, listed_edges: lists of vertices with triangles, and of edges.
-        surface, cloth: of all nodes.
-        rest: positions of all nodes at rest [m].
-        recovery: share of a missing distance that the substep gives back [-].
-        contacts: the list.
-    """
-    begin_sharing(taken, 0)
-    for worker in range(workers):
-        item = next_item(-1, worker, taken, 0, DUE_AT_A_TIME)
-        while item < 2 * count * lanes:
-            if item < count * lanes:
-                look_at_piece(
-                    met.due[item // lanes],
-                    item % lanes,
-                    lanes,
-                    listed,
-                    met,
-                    False,
-                    surface,
-                    cloth,
-                    rest,
-                    recovery,
-                    contacts,
-                )
-            else:
-                look_at_piece(
-                    met.due[item // lanes - count],
-                    item % lanes,
-                    lanes,
-                    listed_edges,
-                    met,
-                    True,
-                    surface,
-                    cloth,
-                    rest,
-                    recovery,
-                    contacts,
-                )
-            item = next_item(item, worker, taken, 0, DUE_AT_A_TIME)
+    return ends[number]
 
 
 @func

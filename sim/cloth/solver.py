@@ -15,7 +15,7 @@ from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
 from sim.cloth.load import NodeLoad
 from sim.cloth.loop_costs import NODE_NS
-from sim.cloth.motion import finish_step, predict_displacement
+from sim.cloth.motion import finish_step
 from sim.cloth.parameters import (
     DEFAULT_SUBSTEPS,
     MOST_REFINED,
@@ -303,14 +303,12 @@ class ClothSolver:
 
     def _predict(self, dt: float) -> None:
         """Gravity and air: of rectangles in nothing but wind by rows, of all others by lists of triangles."""
-        state, air, gravity = self.state, self.air, ti.math.vec3(*self.gravity)
+        air, gravity = self.air, ti.math.vec3(*self.gravity)
         in_rows = self._rectangles_in_wind if air.acts and not air.is_shared else {}
         for rectangle in in_rows.values():
             rectangle.predict(gravity, dt)
         for cloths in _runs_without(in_rows, len(self.parameters)):
-            air.blow(cloths, gravity, dt)
-            first, end = (int(state.host.first_node[number]) for number in (cloths.start, cloths.stop))
-            predict_displacement(state.nodes, state.motion, air.at_nodes, int(air.acts), first, end, gravity, dt)
+            air.predict(cloths, gravity, dt)
 
     def _hold_pins(self) -> None:
         if self._pins.hold(self._time_s):

@@ -13,8 +13,10 @@ from sim.build import build_world
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.motion import finish_step
 from sim.cloth.patch_pairs import PairList
+from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision import SelfCollision
 from sim.cloth.solver import ClothSolver
+from sim.cloth.state import ClothState
 from sim.core.world import World
 from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
@@ -52,6 +54,16 @@ def rigid_of(world: World) -> RigidSolver:
     solver = world.solvers["rigid"]
     assert isinstance(solver, RigidSolver)
     return solver
+
+
+def find(state: ClothState, pairs: SelfCollision) -> ContactList:
+    """List pairs, and find contacts of cloth with cloth, as a substep does."""
+    contacts = ContactList(10**5)
+    while True:
+        contacts.counter.fill(0)
+        pairs.find(state, contacts, 0.1)
+        if not pairs.make_room_for(contacts.counter.to_numpy()[1:].tolist()):
+            return contacts
 
 
 def contacts_of(solver: ClothSolver) -> ContinuousContacts:

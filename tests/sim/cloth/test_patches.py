@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 from cloth_scenes import WEIGHTLESS, cloth, rectangle, solver_of
-from contact_scenes import listed_pairs, listed_places
+from contact_scenes import find, listed_pairs, listed_places
 
 from sim.cloth.patch_pairs import PatchPairs
 from sim.cloth.patches import TRIANGLES_PER_PATCH, Patches
@@ -76,7 +76,7 @@ def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     collides.fill(1)
     met.meet(1.0, 1.0, collides)
     # All are searched: none are so far apart that they might sleep.
-    assert met.age(1.0, 0.0, *nothing_due(met)) == met.count
+    assert met.age(state, 1.0, 0.0, *nothing_due(met)) == met.count
     assert met.count == patches.count * (patches.count + 1) // 2
     corners = pieces(patches.corners, patches.first_corner)
     return met.approach.to_numpy()[: met.count], met.pairs.to_numpy()[: met.count], corners
@@ -117,6 +117,14 @@ def test_a_cloth_of_one_patch_meets_itself():
     assert bound.tolist() == [0.0]
 
 
+def finish(state, pairs: SelfCollision, predicted: ti.Ndarray | None = None) -> list[int]:
+    """A substep is over, with displacements that contacts changed from those `predicted`."""
+    is_changed = predicted is not None
+    return pairs.finish(
+        state, predicted if is_changed else state.displacement, ContactList(1), 0, is_changed=is_changed
+    )
+
+
 def crumple(state, pairs: SelfCollision, count: int) -> None:
     """Some substeps of a flat sheet whose nodes wander."""
     generator, x = np.random.default_rng(2), state.host.position.copy()
@@ -125,8 +133,8 @@ def crumple(state, pairs: SelfCollision, count: int) -> None:
         state.set_positions(x)
         state.displacement.from_numpy(step.astype(np.float32))
         pairs.look(state)
-        pairs.prepare(state)
-        pairs.follow(state, is_changed=False)
+        find(state, pairs)
+        finish(state, pairs)
         x += step
 
 
@@ -137,8 +145,8 @@ def test_frames_that_follow_each_other_search_only_what_has_moved():
     for expected in (True, False, False):
         pairs.begin_frame(state)
         pairs.look(state)
-        pairs.prepare(state)
-        pairs.follow(state, is_changed=False)
+        find(state, pairs)
+        finish(state, pairs)
         assert (pairs.searches > 0.0) == expected
 
 
@@ -152,7 +160,7 @@ def test_cloth_that_is_put_elsewhere_is_searched_anew():
     pairs.begin_frame(state)
     for each in (pairs, anew):
         each.look(state)
-        each.prepare(state)
+        find(state, each)
     assert min(len(each) for each in listed_pairs(anew)) > 100
     assert listed_pairs(pairs) == listed_pairs(anew)
 
@@ -164,10 +172,10 @@ def test_changed_thickness_is_searched_anew():
     state.thickness.fill(0.03)  # beyond the spacing of 25 mm: now neighbours are listed
     pairs.begin_frame(state)
     pairs.look(state)
-    pairs.prepare(state)
+    find(state, pairs)
     anew = SelfCollision(state)
     anew.look(state)
-    anew.prepare(state)
+    find(state, anew)
     assert pairs.thickness == anew.thickness == np.float32(0.03)
     assert min(len(each) for each in listed_pairs(anew)) > 100
     assert listed_pairs(pairs) == listed_pairs(anew)
@@ -186,13 +194,12 @@ def test_pairs_keep_a_changed_thickness_where_a_thicker_cloth_changes_nothing():
     for name in ("lower", "upper"):
         pairs.begin_frame(state)
         pairs.look(state)
-        pairs.prepare(state)
+        find(state, pairs)
         solver.change(name, thickness=0.004)
     pairs.begin_frame(state)
     pairs.look(state)
-    pairs.prepare(state)
+    find(state, pairs)
     assert pairs.thickness == np.float32(0.008)
-    pairs.find(state, ContactList(10**5), 0.1)
     for each in (pairs.with_triangles, pairs.of_edges):
         places = listed_places(pairs, each)
         vertices, wanted = each.vertices.to_numpy()[places], each.wanted.to_numpy()[places]
@@ -210,14 +217,13 @@ def test_one_wild_vertex_has_only_its_own_surroundings_watched():
     pairs, predicted = SelfCollision(state), ti.Vector.ndarray(3, ti.f32, 33 * 33)
     predicted.fill(0.0)
     pairs.look(state)
-    pairs.prepare(state)
+    find(state, pairs)
     displacement = np.zeros((33 * 33, 3), dtype=np.float32)
     displacement[0, 2] = 0.02
     state.displacement.from_numpy(displacement)
-    change, beyond = pairs.measure_changes(state, predicted)
-    assert change == beyond == np.float32(0.02)
+    assert finish(state, pairs, predicted) == [0, 1, 0]
     pairs.look(state)
-    pairs.prepare(state)
+    find(state, pairs)
     allowed = pairs.patch_pairs.allowed.to_numpy()[: pairs.patch_pairs.count]
     both = pairs.patch_pairs.pairs.to_numpy()[: pairs.patch_pairs.count]
     of_wild = np.isin(both, [m for m, corners in enumerate(corners_of(pairs)) if 0 in corners]).any(axis=1)
@@ -258,7 +264,7 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
         before = pairs.patch_pairs.count, pairs.searches
         pairs.look(state)
         is_met, known = pairs._is_outrun and before[0] > 0, pairs.patch_pairs.slack.to_numpy()[: before[0]] > 0.0
-        pairs.prepare(state)
+        find(state, pairs)
         if is_met:
             meetings += 1
             carried = pairs.patch_pairs.carried.to_numpy()[: pairs.patch_pairs.count]
@@ -267,9 +273,9 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
             # And what they list is what is there, and what is not near is not missed.
             anew.forget()
             anew.look(state)
-            anew.prepare(state)
+            find(state, anew)
             assert near_pairs(state, pairs) == near_pairs(state, anew)
-        pairs.follow(state, is_changed=False)
+        finish(state, pairs)
         x += step
     assert meetings >= 2
     assert max(searched) < 0.5 * anew.searches / meetings
@@ -277,9 +283,8 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
 
 def near_pairs(state, pairs: SelfCollision) -> list[tuple[int, ...]]:
     """What is found in the lists, in an order of its own."""
-    contacts = ContactList(10**5)
-    pairs.find(state, contacts, 0.1)
-    return sorted(map(tuple, contacts.vertices.to_numpy()[: contacts.take_found()].tolist()))
+    contacts = find(state, pairs)
+    return sorted(map(tuple, contacts.vertices.to_numpy()[: contacts.counter.to_numpy()[0]].tolist()))
 
 
 def test_patches_are_searched_anew_only_where_cloth_moves():
@@ -290,7 +295,7 @@ def test_patches_are_searched_anew_only_where_cloth_moves():
     at_corner = (x[:, :2] > 0.3).all(axis=1)
     displacement = np.zeros((33 * 33, 3), dtype=np.float32)
     pairs.look(state)
-    pairs.prepare(state)
+    find(state, pairs)
     once = pairs.searches
     generator, height = np.random.default_rng(1), np.zeros(33 * 33)
     for _ in range(30):
@@ -298,8 +303,8 @@ def test_patches_are_searched_anew_only_where_cloth_moves():
         displacement[:, 2] = target - height
         state.displacement.from_numpy(displacement)
         pairs.look(state)
-        pairs.prepare(state)
-        pairs.follow(state, is_changed=False)
+        find(state, pairs)
+        finish(state, pairs)
         height = target
         state.set_positions(x + height[:, None] * (0.0, 0.0, 1.0))
     # The corner is a thirtieth of the sheet, and its patches and those beside them are less than a fifth.

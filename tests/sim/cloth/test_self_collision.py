@@ -10,6 +10,7 @@ from contact_scenes import (
     cloth_of,
     contacts_of,
     displace,
+    find,
     listed_pairs,
     point_triangle_distances,
     segment_distances,
@@ -64,7 +65,7 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
     )
     pairs = SelfCollision(state)
     pairs.look(state)
-    pairs.prepare(state)
+    find(state, pairs)
     found, found_edges = listed_pairs(pairs)
     # A pair of patches is searched as far as its own motion asks for, to a thickness at least.
     reach = pairs._met.reach.to_numpy()[: pairs._met.count].max()
@@ -339,13 +340,13 @@ FALL = {
 def test_contacts_do_not_depend_on_when_pairs_were_searched_for():
     listed, anew = world_of(FALL), world_of(FALL)
     pairs = contacts_of(cloth_of(anew))._pairs
-    search = pairs.prepare
+    look = pairs.look
 
-    def search_always(state):
+    def look_anew(state):
         pairs.forget()
-        search(state)
+        return look(state)
 
-    pairs.prepare = search_always
+    pairs.look = look_anew
     for _ in range(12):
         listed.advance_frame()
         anew.advance_frame()

@@ -1,0 +1,142 @@
+"""The end of a substep's contacts in one launch: whether pairs may have crossed, and what of the lists is used up."""
+
+import taichi as ti
+
+from sim.cloth.bundles import Contacts, PatchBounds, PatchBudget, PatchNodes, PatchPairArrays, SubstepEnd, TrackedNodes
+from sim.cloth.continuous_response import repair_crossing
+from sim.cloth.patch_motion_kernels import (
+    PAIRS_AT_A_TIME,
+    PATCHES_AT_A_TIME,
+    WIDENED,
+    finish_pair,
+    finish_patch,
+    measure_change,
+)
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.launch import kernel
+from sim.core.scheduling import begin_sharing, next_item
+
+
+@kernel
+def end_contacts(
+    count: ti.i32,
+    contacts: Contacts,
+    impulse: Vectors,
+    inverse_mass: Floats,
+    thickness: Floats,
+    crossing: Integers,
+    vertex_count: ti.i32,
+    nodes: TrackedNodes,
+    predicted: Vectors,
+    corners: PatchNodes,
+    patches: PatchBounds,
+    budget: PatchBudget,
+    end: SubstepEnd,
+    met: PatchPairArrays,
+    workers: ti.math.ivec3,
+    taken: Integers,
+    counter: Integers,
+    is_short: ti.template(),
+) -> ti.math.ivec3:
+    """Test `count` contacts (`repair_crossing`); if none failed, measure how far they displaced patches; if not farther
+    than allowed for, displacements are final: note where they lead, and what of the lists they use up.
+
+    Args:
+        count, contacts, impulse, inverse_mass, thickness, crossing: see `repair_crossing`.
+        vertex_count, nodes, corners: the vertices, and those of each patch.
+        predicted: displacements before contacts [m].
+        patches, budget, end, met: see `finish_patch` and `finish_pair`.
+        workers, taken: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
+        counter: three integers to count with.
+
+    Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
+    is not finite.
+    """
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, vertices_end, displaced_end, patches_end, pairs_end = (
+        count,
+        vertex_count,
+        workers[0],
+        workers[1],
+        workers[2],
+    )
+    counter[0], counter[1], counter[2] = 0, 0, 0
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for c in range(contacts_end):
+        repair_crossing(
+            c, contacts, impulse, nodes.position, nodes.displacement, inverse_mass, thickness, crossing, counter
+        )
+    begin_sharing(taken, 0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for worker in range(displaced_end):
+        stop = ti.select(counter[0] == 0, corners.count, 0)
+        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while m < stop:
+            measure_change(
+                m,
+                corners,
+                nodes.displacement,
+                predicted,
+                end.half_thickness,
+                budget.change,
+                budget.margin,
+                budget.more,
+                counter,
+            )
+            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for i in range(vertices_end):
+        if counter[0] + counter[1] + counter[2] == 0:
+            nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
+    begin_sharing(taken, 1)
+    for worker in range(patches_end):
+        stop = ti.select(counter[0] + counter[1] + counter[2] == 0, corners.count, 0)
+        m = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
+        while m < stop:
+            finish_patch(m, nodes, corners, patches, budget, end)
+            m = next_item(m, worker, taken, 1, PATCHES_AT_A_TIME)
+    begin_sharing(taken, 2)
+    for worker in range(pairs_end):
+        stop = ti.select(counter[0] + counter[1] + counter[2] == 0, met.count, 0)
+        p = next_item(-1, worker, taken, 2, PAIRS_AT_A_TIME)
+        while p < stop:
+            finish_pair(p, met, patches, budget, end.negligible)
+            p = next_item(p, worker, taken, 2, PAIRS_AT_A_TIME)
+    return ti.math.ivec3(counter[0], counter[1], counter[2])
+
+
+@kernel
+def end_lone_contacts(
+    corners: PatchNodes,
+    displacement: Vectors,
+    predicted: Vectors,
+    is_changed: ti.i32,
+    least: ti.f32,
+    change: Floats,
+    margin: Floats,
+    more: Floats,
+    counter: Integers,
+    workers: ti.i32,
+    taken: Integers,
+    is_short: ti.template(),
+) -> ti.math.ivec3:
+    """The same of cloth that meets no cloth: margins for the next substep are all that follows from this one."""
+    workers_end, patches_end = workers, corners.count
+    counter[0], counter[1], counter[2] = 0, 0, 0
+    begin_sharing(taken, 0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for worker in range(workers_end):
+        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while m < corners.count:
+            measure_change(m, corners, displacement, predicted, 0.0, change, margin, more, counter)
+            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for m in range(patches_end):
+        if counter[1] + counter[2] == 0:
+            margin[m] = ti.max(least, ti.select(is_changed == 1, WIDENED * change[m], 0.0))
+    return ti.math.ivec3(counter[0], counter[1], counter[2])
