@@ -121,13 +121,17 @@ class ClothSolver:
         self.contacts: list[ClothContacts] = []
         self.load: NodeLoad | None = None
         shared = self.parameters[0]
-        apart = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
+        in_rows = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
         first = host.first_node.tolist()
-        families = joined_springs([springs_of(sheet) for sheet in sheets], first, apart=apart)
+        groups = [
+            (number in in_rows, cloth.iterations or 0, cloth.substeps is None)
+            for number, cloth in enumerate(self.parameters)
+        ]
+        families = joined_springs([springs_of(sheet) for sheet in sheets], first, groups=groups)
         self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
         self._cells = [
             DeviceCells(cells, cloth_of)
-            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first, apart=apart)
+            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first, groups=groups)
         ]
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
         self._totals = ClothTotals(self.state, self._springs, self._cells)
@@ -226,17 +230,18 @@ class ClothSolver:
         self.parameters = parameters
         self._take_parameters()
         self._pins.hold_anew()
-        self._own_dt = self._largest_dt()
+        self._asked_dt, self._free_dt = self._largest_dts()
 
     # --- the step ---------------------------------------------------------------------------------------------------
 
     def stable_dt(self) -> float:
         """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear.
 
-        If no number of substeps is given, a fraction of that while springs are longer than their tension makes them by
-        what contacts do: what these push out and springs pull back in does not settle in long steps, and gains energy.
+        Of cloths for which no number of substeps is given, a fraction of that while their springs are longer than their
+        tension makes them by what contacts do: what these push out and springs pull back in does not settle in long
+        steps, and gains energy.
         """
-        dt = self._own_dt / (self._refinement if self.parameters[0].substeps is None else 1)
+        dt = min(self._asked_dt, self._free_dt / self._refinement)
         for contacts in self.contacts:
             dt = contacts.stable_dt(self.state, dt)
         return dt
@@ -259,28 +264,29 @@ class ClothSolver:
     def _displace(self, dt: float) -> None:
         """Springs and contacts in turns; as these leave springs too long, the next step has more sweeps, or is shorter.
 
-        One sweep, and no measure of springs by themselves, where a job gives `substeps`: these are what it pays for.
+        One sweep, and no measure of springs by themselves, of a cloth that is given `substeps`: these are what it pays
+        for. Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
+        shortened for those that omit `substeps`.
         """
-        integrator, shared = self._integrator, self.parameters[0]
-        adapts = shared.iterations is None and shared.substeps is None
-        turns, most_turns = 0, MOST_TURNS if shared.iterations is None else 0
-        integrator.displace(dt, self._sweeps if adapts else shared.iterations or 1)
+        integrator, turns = self._integrator, 0
+        integrator.displace(dt, np.where(self._adapts, self._sweeps, self._iterations))
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        excess = integrator.excess(dt) if adapts and is_loose else None
-        by_springs = excess or 0.0
+        excess = integrator.excess(dt) if self._adapts.any() and is_loose else None
+        by_springs = 0.0 if excess is None else float(excess[self._adapts].max())
 
         def relax() -> bool:
             nonlocal turns, excess
             excess = integrator.excess(dt)
-            if turns == most_turns or excess < RELAXED_BEYOND:
+            if turns == MOST_TURNS or excess[self._takes_turns].max(initial=0.0) < RELAXED_BEYOND:
                 return False
             turns += 1
-            integrator.sweep(dt)
+            integrator.sweep(dt, self._takes_turns)
             return True
 
         for contacts in self.contacts:
             contacts.resolve(self.state, dt, relax)
-        self._excess = integrator.excess(dt) if excess is None else excess
+        excess = integrator.excess(dt) if excess is None else excess
+        self._excess = float(excess[self._refines].max(initial=0.0))
         if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
@@ -314,7 +320,7 @@ class ClothSolver:
 
     def _hold_pins(self) -> None:
         if self._pins.hold(self._time_s):
-            self._own_dt = self._largest_dt()
+            self._asked_dt, self._free_dt = self._largest_dts()
 
     # --- what it is built from --------------------------------------------------------------------------------------
 
@@ -325,23 +331,31 @@ class ClothSolver:
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
         self._integrator.take_parameters(cloths)
+        self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
+        self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
+        self._refines = np.array([cloth.substeps is None for cloth in cloths])
+        self._adapts = self._takes_turns & self._refines
         self.air.take_parameters(cloths)
         for number, rectangle in self._rectangles_in_wind.items():
             rectangle.take_parameters(cloths[number])
         self._mass = float(self.state.mass.to_numpy().sum(dtype=np.float64))
 
-    def _largest_dt(self) -> float:
-        """Largest step [s] without contacts.
+    def _largest_dts(self) -> tuple[float, float]:
+        """Largest step without contacts [s]: of cloths that are given `substeps`, and of those that omit it.
 
         Raises:
             ValueError: the share of a frame that was asked for is longer than what explicit springs bear.
         """
-        first, stable_dt = self.parameters[0], self._integrator.stable_dt()
-        if first.substeps is None:
-            return min(self._frame_dt / DEFAULT_SUBSTEPS, ACCURATE_SHARE * stable_dt)
-        if reason := too_few_substeps(first.substeps, self._frame_dt, stable_dt):
-            raise ValueError(f'cloth "{first.name}": {reason}')
-        return self._frame_dt / first.substeps
+        frame_dt, free_dt = self._frame_dt, np.inf
+        if self._refines.any():
+            free_dt = min(frame_dt / DEFAULT_SUBSTEPS, ACCURATE_SHARE * self._integrator.stable_dt(self._refines))
+        asking = max(self.parameters, key=lambda cloth: cloth.substeps or 0)
+        if asking.substeps is None:
+            return np.inf, free_dt
+        stable_dt = self._integrator.stable_dt()
+        if min(frame_dt / asking.substeps, free_dt) > stable_dt:
+            raise ValueError(f'cloth "{asking.name}": {too_few_substeps(asking.substeps, frame_dt, stable_dt)}')
+        return frame_dt / asking.substeps, free_dt
 
     # --- what goes out ----------------------------------------------------------------------------------------------
 

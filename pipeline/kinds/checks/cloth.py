@@ -48,14 +48,14 @@ def check_cloths(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         _check_place(start, job.domain, findings)
         _check_size(start, job.domain, findings)
         _check_spacing(start, findings)
-        check_pin_speeds(start, job.fps, findings)
+        check_pin_speeds(start, job, findings)
         check_pin_load(start, job, fluid_over(job, solids, start.box), findings)
         check_buoyancy(job, start.path, start.cloth, findings)
-        _check_substeps(start, job.fps, findings)
         for path, solid in solids.items():
             if path[0] == "rigid":
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
         _check_crossings(start, starts[:number], findings)
+    _check_substeps([start for start in starts if start.cloth.integrator == "explicit"], job.fps, findings)
     if starts:
         check_bodies_for_cloth(job, solids, starts, findings)
     return sum(len(start.position) for start in starts)
@@ -122,11 +122,33 @@ def _check_spacing(start: ClothStart, findings: Findings) -> None:
         )
 
 
-def _check_substeps(start: ClothStart, fps: int, findings: Findings) -> None:
-    """Explicit springs are unstable beyond their step, and without a number of substeps dictate theirs."""
+def _check_substeps(starts: Sequence[ClothStart], fps: int, findings: Findings) -> None:
+    """Explicit springs are unstable beyond their step, and without a number of substeps dictate theirs.
+
+    Cloths step together, as often as the one that takes most.
+    """
+    longest = [_longest_step(start) for start in starts]
+    taken = [
+        start.cloth.substeps or math.ceil(1.0 / (fps * ACCURATE_SHARE * step))
+        for start, step in zip(starts, longest, strict=True)
+    ]
+    for start, step, substeps in zip(starts, longest, taken, strict=True):
+        if start.cloth.substeps is not None:
+            if reason := too_few_substeps(max(taken), 1.0 / fps, step):
+                findings.error((*start.path, "substeps"), reason)
+            continue
+        takes = f'"explicit" takes {count(substeps)} substeps a frame of springs of this stiffness and mass'
+        helps = 'give a softer stretch_stiffness or a coarser sheet, or use "xpbd"'
+        if substeps > MAX_SUBSTEPS_PER_FRAME:
+            most = count(MAX_SUBSTEPS_PER_FRAME)
+            findings.error((*start.path, "integrator"), f"{takes}, more than the {most} at which a run ends: {helps}")
+        elif substeps > MANY_SUBSTEPS:
+            findings.warn((*start.path, "integrator"), f"{takes}, which takes long: {helps}")
+
+
+def _longest_step(start: ClothStart) -> float:
+    """Longest step that is stable for the explicit springs of a cloth [s]."""
     cloth = start.cloth
-    if cloth.integrator != "explicit":
-        return
     families = [
         (springs, (1.0 + cloth.poisson_ratio) * springs.stiffness(cloth), springs.damping(cloth))
         for springs in springs_of(start.sheet)
@@ -134,19 +156,7 @@ def _check_substeps(start: ClothStart, fps: int, findings: Findings) -> None:
     # Nodes that are released later need shorter steps from then on.
     inverse_mass = np.where(start.held_for_ever, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
     cells = cells_of(start.sheet)
-    longest = longest_explicit_step(families, [(cells, cells.law(cloth))], inverse_mass)
-    if cloth.substeps is not None:
-        if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest):
-            findings.error((*start.path, "substeps"), reason)
-        return
-    substeps = math.ceil(1.0 / (fps * ACCURATE_SHARE * longest))
-    takes = f'"explicit" takes {count(substeps)} substeps a frame of springs of this stiffness and mass'
-    helps = 'give a softer stretch_stiffness or a coarser sheet, or use "xpbd"'
-    if substeps > MAX_SUBSTEPS_PER_FRAME:
-        most = count(MAX_SUBSTEPS_PER_FRAME)
-        findings.error((*start.path, "integrator"), f"{takes}, more than the {most} at which a run ends: {helps}")
-    elif substeps > MANY_SUBSTEPS:
-        findings.warn((*start.path, "integrator"), f"{takes}, which takes long: {helps}")
+    return longest_explicit_step(families, [(cells, cells.law(cloth))], inverse_mass)
 
 
 def _check_inside(start: ClothStart, body: str, solid: Solid, findings: Findings) -> None:
