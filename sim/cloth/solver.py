@@ -31,6 +31,7 @@ from sim.cloth.row_air import RectangleAir
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import joined_cells, joined_springs, springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
+from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
@@ -43,9 +44,6 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 SOLVER_NAME = "cloth"
 
 INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
-
-LOST_DISTANCE = 10.0
-"""Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
 
 REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW = 0.05, 0.03, 0.02
 """Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; beyond
@@ -97,7 +95,8 @@ class ClothSolver:
 
     Raises:
         ShapeError: a mesh cannot be read, or is no sheet.
-        ValueError: cloths that cannot step together, a pin that holds nothing, too few substeps for explicit springs.
+        ValueError: cloths that cannot step together, a pin that holds nothing, too few substeps for explicit springs,
+            a scene so large that positions are too coarse.
     """
 
     def __init__(
@@ -116,22 +115,26 @@ class ClothSolver:
         sheets = [build_sheet(cloth.shape) for cloth in self.parameters]
         self.warnings = tuple(warning for sheet in sheets for warning in sheet.warnings)
         host = HostCloths.of(self.parameters, sheets)
-        self.state = ClothState(host, reach=_reach(domain, host.position))
+        reach = reach_of(domain, host.position)
+        for cloth, (first, end) in zip(self.parameters, pairwise(host.first_node), strict=True):
+            if reason := too_coarse_positions(cloth, host.position[first:end], reach):
+                raise ValueError(f'cloth "{cloth.name}": {reason}')
+        self.state = ClothState(host, reach=reach)
         self.gravity = gravity
         self.contacts: list[ClothContacts] = []
         self.load: NodeLoad | None = None
         shared = self.parameters[0]
         in_rows = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
-        first = host.first_node.tolist()
+        first_nodes = host.first_node.tolist()
         groups = [
             (number in in_rows, cloth.iterations or 0, cloth.substeps is None)
             for number, cloth in enumerate(self.parameters)
         ]
-        families = joined_springs([springs_of(sheet) for sheet in sheets], first, groups=groups)
+        families = joined_springs([springs_of(sheet) for sheet in sheets], first_nodes, groups=groups)
         self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
         self._cells = [
             DeviceCells(cells, cloth_of)
-            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first, groups=groups)
+            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first_nodes, groups=groups)
         ]
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
         self._totals = ClothTotals(self.state, self._springs, self._cells)
@@ -449,10 +452,3 @@ def _runs_without(left_out: Collection[int], count: int) -> list[range]:
     """The numbers 0 ... count - 1 but some, in runs of neighbours."""
     ends = [-1, *sorted(left_out), count]
     return [range(a + 1, b) for a, b in pairwise(ends) if b > a + 1]
-
-
-def _reach(domain: DomainParameters, positions: NDArray[np.float64]) -> float:
-    """How far from the origin, along an axis, cloth may come [m]."""
-    corners = np.concatenate([np.array([domain.min, domain.max]), positions])
-    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    return float(np.abs(corners).max()) + LOST_DISTANCE * diagonal

@@ -46,6 +46,19 @@ KEYFRAMES = "keyframe = [{ time_s = 0.0 }, { time_s = 1.0, offset = [0.1, 0.0, 0
             '4 cloth[0]: starts inside "ball", as at (0.03333, 0.01667, 0.5) m',
         ),
         (
+            # Thinner still, and beside the middle: a needle.
+            SHEET + BALL.replace("radius = 0.1", "radius = 0.004").replace("0.0, 0.0, 0.3]", "0.04, 0.005, 0.5]"),
+            '4 cloth[0]: starts inside "ball", as at (0.04',
+        ),
+        (
+            SHEET.replace("[9, 9]", "[21, 21]") + "thickness = 0.6",
+            "8 cloth[0].thickness: 0.6 m is so much more than the 0.019 m ... that 440 of ... 300 at most; make it",
+        ),
+        (
+            SHEET.replace("[domain]", "[domain]\nmax = [1e5, 1e5, 1e5]"),
+            "5 cloth[0]: its positions are rounded to 0.002 m, and its layers keep 0.0005 m; make the domain smaller",
+        ),
+        (
             SHEET + SECOND + "rotation_deg = [0.0, 90.0, 0.0]",
             '9 cloth[1]: passes through or touches cloth "sheet" at (0.03, -0.15, 0.5) m ... 0.0005 m or more apart',
         ),
