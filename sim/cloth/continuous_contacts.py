@@ -36,6 +36,9 @@ TOLERANCE = 0.02
 REPAIRS = 4
 """Rounds in which crossing pairs are pushed before they become impact zones."""
 
+MANY_CONTACTS = 16
+"""Contacts a vertex for which kernels are compiled: heaps and knots come to ten and more."""
+
 LEAST_GAP = 0.02
 """Layers are never let nearer than this, in their thickness, as far as contacts and impact zones decide it."""
 
@@ -253,7 +256,7 @@ class ContinuousContacts:
 
     def _warm_up(self, state: ClothState) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
-        for short in sorted({self._is_short(0), self._is_short(self._contacts.capacity)}):
+        for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
             self._begin_push(state, 0, is_first=True, short=short)
             self._push_on(0, 0, 0, short=short)
             if self._meets_cloth:
