@@ -101,7 +101,7 @@ def measure(nodes: int, arguments: argparse.Namespace) -> dict[str, Any]:
             for name, part in {
                 "damping": lambda: integrator.accelerate(dt),
                 "air_and_gravity": lambda: solver._predict(dt),
-                "springs": lambda: integrator.displace(dt, 1),
+                "springs": lambda: integrator.displace(dt, np.ones(1, dtype=int)),
             }.items()
         },
         "diagnostics": dict(solver.diagnostics()),

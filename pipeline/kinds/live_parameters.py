@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from sim.cloth.parameters import DEFAULT_SUBSTEPS
+from sim.cloth.parameters import substeps_of
 
 Value = float | bool | tuple[float, float, float]
 Widget = Literal["number", "decades", "whole", "switch", "vector"]
@@ -120,7 +120,7 @@ def _of_cloth(job: Job, written: Job) -> Iterator[Parameter]:
     """Substeps, which explicit springs dictate, and the keys above."""
     if job.cloth[0].integrator == "xpbd":
         paths = tuple(("cloth", number, "substeps") for number in range(len(job.cloth)))
-        count, asked = (each.cloth[0].substeps or DEFAULT_SUBSTEPS for each in (job, written))
+        count, asked = (substeps_of(each.cloth) for each in (job, written))
         ends = min(SUBSTEPS_RANGE[0], asked), max(SUBSTEPS_RANGE[1], asked)
         yield Parameter.within("cloth.substeps", "substeps a frame", "Scene", "whole", *paths, ends=ends, start=count)
     for number, cloth in enumerate(job.cloth):

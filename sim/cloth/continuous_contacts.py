@@ -33,6 +33,9 @@ in stacks and impacts; two layers under their weight need one step."""
 REPAIRS = 4
 """Rounds in which crossing pairs are pushed before they become impact zones."""
 
+MANY_CONTACTS = 16
+"""Contacts a vertex for which kernels are compiled: heaps and knots come to ten and more."""
+
 RECOVERY_TIME_S = 0.01
 """Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""
 
@@ -243,7 +246,7 @@ class ContinuousContacts:
 
     def _warm_up(self, state: ClothState) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
-        for short in sorted({self._is_short(0), self._is_short(self._contacts.capacity)}):
+        for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
             self._begin_push(state, 0, is_first=True, short=short)
             self._push_on(0, 0, 0, short=short)
         if self._meets_cloth:

@@ -52,19 +52,22 @@ class ExplicitSprings:
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
         """Springs hold their own stiffness."""
 
-    def excess(self, dt: float) -> float:  # noqa: ARG002  (the integrators' protocol)
+    def excess(self, dt: float) -> NDArray[np.float64]:  # noqa: ARG002  (the integrators' protocol)
         """None: springs are as long as their forces make them."""
-        return 0.0
+        return np.zeros(len(self._state.names))
 
     def diagnostics(self) -> Mapping[str, float]:
         """None of its own."""
         return {}
 
-    def stable_dt(self) -> float:
-        """Longest stable step [s]."""
+    def stable_dt(self, cloths: NDArray[np.bool_] | None = None) -> float:
+        """Longest step that is stable for some of the cloths, or all [s]."""
         families = [(each.host, (1.0 + each.poisson) * each.stiffness, each.damping) for each in self._springs]
         cells = [(each.host, each.law) for each in self._cells]
-        return longest_explicit_step(families, cells, self._state.inverse_mass.to_numpy())
+        inverse_mass = self._state.inverse_mass.to_numpy()
+        if cloths is not None:
+            inverse_mass[~cloths[self._state.host.body]] = 0.0
+        return longest_explicit_step(families, cells, inverse_mass)
 
     def accelerate(self, dt: float) -> None:
         """Give the springs' impulses of a step of dt [s] to the velocities."""
@@ -82,10 +85,10 @@ class ExplicitSprings:
             self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
         )
 
-    def displace(self, dt: float, sweeps: int) -> None:
+    def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Displacements follow from velocities alone."""
 
-    def sweep(self, dt: float) -> None:
+    def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
         """Nor do they follow contacts."""
 
 

@@ -223,7 +223,8 @@ class ClothParameters(Parameters):
     substeps: Annotated[int, Field(ge=1, le=100_000)] | None = Field(
         default=None,
         description=f"Steps per frame [-]; if omitted {DEFAULT_SUBSTEPS}, and up to {MOST_REFINED} times as many while "
-        "springs are longer than their tension makes them; for explicit as many as it takes to keep the energy.",
+        "springs are longer than their tension makes them; for explicit as many as it takes to keep the energy. Cloths "
+        "of a job take the same steps, as many as the one with the most asks for, or those that omit it need.",
     )
     iterations: Annotated[int, Field(ge=1, le=100)] | None = Field(
         default=None,
@@ -233,7 +234,7 @@ class ClothParameters(Parameters):
         "A sweep does not "
         "let every spring know of all that hangs on it: cloth that hangs from single points, and any mesh, stretches "
         "too much there, by less with each sweep and with the square of the step; a run warns of springs that get half "
-        "too long by it.",
+        "too long by it. Of each cloth its own.",
     )
 
     @model_validator(mode="before")
@@ -261,23 +262,23 @@ class ClothParameters(Parameters):
         return self
 
 
-SHARED_KEYS = ("integrator", "substeps", "iterations")
-"""What all cloths of a scene have in common, as they step together."""
-
-
 def shared_conflicts(cloths: tuple[ClothParameters, ...]) -> list[tuple[int, str, str]]:
     """Why cloths cannot step together: number of the cloth, its key, and a sentence, for each reason."""
+    first = cloths[0] if cloths else None
     return [
         (
             number,
-            key,
-            f"is {_written(getattr(cloth, key))}, but {_written(getattr(cloths[0], key))} in cloth[0] "
-            f'"{cloths[0].name}"; all cloths share it',
+            "integrator",
+            f'is "{cloth.integrator}", but "{first.integrator}" in cloth[0] "{first.name}"; all cloths share it',
         )
-        for number, cloth in enumerate(cloths[1:], start=1)
-        for key in SHARED_KEYS
-        if getattr(cloth, key) != getattr(cloths[0], key)
+        for number, cloth in enumerate(cloths)
+        if first and cloth.integrator != first.integrator
     ]
+
+
+def substeps_of(cloths: Sequence[ClothParameters]) -> int:
+    """Steps a frame that cloths of XPBD take together, where none are refined: what the one with the most asks for."""
+    return max((cloth.substeps or DEFAULT_SUBSTEPS for cloth in cloths), default=DEFAULT_SUBSTEPS)
 
 
 THINNEST_AIR = 1.0e-3

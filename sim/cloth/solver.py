@@ -31,6 +31,7 @@ from sim.cloth.row_air import RectangleAir
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import joined_cells, joined_springs, springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
+from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
@@ -43,9 +44,6 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 SOLVER_NAME = "cloth"
 
 INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
-
-LOST_DISTANCE = 10.0
-"""Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
 
 REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.03, 0.02, 0.035
 """Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; beyond
@@ -97,7 +95,8 @@ class ClothSolver:
 
     Raises:
         ShapeError: a mesh cannot be read, or is no sheet.
-        ValueError: cloths that cannot step together, a pin that holds nothing, too few substeps for explicit springs.
+        ValueError: cloths that cannot step together, a pin that holds nothing, too few substeps for explicit springs,
+            a scene so large that positions are too coarse.
     """
 
     def __init__(
@@ -116,18 +115,26 @@ class ClothSolver:
         sheets = [build_sheet(cloth.shape) for cloth in self.parameters]
         self.warnings = tuple(warning for sheet in sheets for warning in sheet.warnings)
         host = HostCloths.of(self.parameters, sheets)
-        self.state = ClothState(host, reach=_reach(domain, host.position))
+        reach = reach_of(domain, host.position)
+        for cloth, (first, end) in zip(self.parameters, pairwise(host.first_node), strict=True):
+            if reason := too_coarse_positions(cloth, host.position[first:end], reach):
+                raise ValueError(f'cloth "{cloth.name}": {reason}')
+        self.state = ClothState(host, reach=reach)
         self.gravity = gravity
         self.contacts: list[ClothContacts] = []
         self.load: NodeLoad | None = None
         shared = self.parameters[0]
-        apart = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
-        first = host.first_node.tolist()
-        families = joined_springs([springs_of(sheet) for sheet in sheets], first, apart=apart)
+        in_rows = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
+        first_nodes = host.first_node.tolist()
+        groups = [
+            (number in in_rows, cloth.iterations or 0, cloth.substeps is None)
+            for number, cloth in enumerate(self.parameters)
+        ]
+        families = joined_springs([springs_of(sheet) for sheet in sheets], first_nodes, groups=groups)
         self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
         self._cells = [
             DeviceCells(cells, cloth_of)
-            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first, apart=apart)
+            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first_nodes, groups=groups)
         ]
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
         self._totals = ClothTotals(self.state, self._springs, self._cells)
@@ -226,17 +233,18 @@ class ClothSolver:
         self.parameters = parameters
         self._take_parameters()
         self._pins.hold_anew()
-        self._own_dt = self._largest_dt()
+        self._asked_dt, self._free_dt = self._largest_dts()
 
     # --- the step ---------------------------------------------------------------------------------------------------
 
     def stable_dt(self) -> float:
         """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear.
 
-        If no number of substeps is given, a fraction of that while springs are longer than their tension makes them by
-        what contacts do: what these push out and springs pull back in does not settle in long steps, and gains energy.
+        Of cloths for which no number of substeps is given, a fraction of that while their springs are longer than their
+        tension makes them by what contacts do: what these push out and springs pull back in does not settle in long
+        steps, and gains energy.
         """
-        dt = self._own_dt / (self._refinement if self.parameters[0].substeps is None else 1)
+        dt = min(self._asked_dt, self._free_dt / self._refinement)
         for contacts in self.contacts:
             dt = contacts.stable_dt(self.state, dt)
         return dt
@@ -259,28 +267,29 @@ class ClothSolver:
     def _displace(self, dt: float) -> None:
         """Springs and contacts in turns; as these leave springs too long, the next step has more sweeps, or is shorter.
 
-        One sweep, and no measure of springs by themselves, where a job gives `substeps`: these are what it pays for.
+        One sweep, and no measure of springs by themselves, of a cloth that is given `substeps`: these are what it pays
+        for. Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
+        shortened for those that omit `substeps`.
         """
-        integrator, shared = self._integrator, self.parameters[0]
-        adapts = shared.iterations is None and shared.substeps is None
-        turns, most_turns = 0, MOST_TURNS if shared.iterations is None else 0
-        integrator.displace(dt, self._sweeps if adapts else shared.iterations or 1)
+        integrator, turns = self._integrator, 0
+        integrator.displace(dt, np.where(self._adapts, self._sweeps, self._iterations))
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        excess = integrator.excess(dt) if adapts and is_loose else None
-        by_springs = excess or 0.0
+        excess = integrator.excess(dt) if self._adapts.any() and is_loose else None
+        by_springs = 0.0 if excess is None else float(excess[self._adapts].max())
 
         def relax() -> bool:
             nonlocal turns, excess
             excess = integrator.excess(dt)
-            if turns == most_turns or excess < RELAXED_BEYOND:
+            if turns == MOST_TURNS or excess[self._takes_turns].max(initial=0.0) < RELAXED_BEYOND:
                 return False
             turns += 1
-            integrator.sweep(dt)
+            integrator.sweep(dt, self._takes_turns)
             return True
 
         for contacts in self.contacts:
             contacts.resolve(self.state, dt, relax)
-        self._excess = integrator.excess(dt) if excess is None else excess
+        excess = integrator.excess(dt) if excess is None else excess
+        self._excess = float(excess[self._refines].max(initial=0.0))
         if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
@@ -312,7 +321,7 @@ class ClothSolver:
 
     def _hold_pins(self) -> None:
         if self._pins.hold(self._time_s):
-            self._own_dt = self._largest_dt()
+            self._asked_dt, self._free_dt = self._largest_dts()
 
     # --- what it is built from --------------------------------------------------------------------------------------
 
@@ -323,23 +332,31 @@ class ClothSolver:
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
         self._integrator.take_parameters(cloths)
+        self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
+        self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
+        self._refines = np.array([cloth.substeps is None for cloth in cloths])
+        self._adapts = self._takes_turns & self._refines
         self.air.take_parameters(cloths)
         for number, rectangle in self._rectangles_in_wind.items():
             rectangle.take_parameters(cloths[number])
         self._mass = float(self.state.mass.to_numpy().sum(dtype=np.float64))
 
-    def _largest_dt(self) -> float:
-        """Largest step [s] without contacts.
+    def _largest_dts(self) -> tuple[float, float]:
+        """Largest step without contacts [s]: of cloths that are given `substeps`, and of those that omit it.
 
         Raises:
             ValueError: the share of a frame that was asked for is longer than what explicit springs bear.
         """
-        first, stable_dt = self.parameters[0], self._integrator.stable_dt()
-        if first.substeps is None:
-            return min(self._frame_dt / DEFAULT_SUBSTEPS, ACCURATE_SHARE * stable_dt)
-        if reason := too_few_substeps(first.substeps, self._frame_dt, stable_dt):
-            raise ValueError(f'cloth "{first.name}": {reason}')
-        return self._frame_dt / first.substeps
+        frame_dt, free_dt = self._frame_dt, np.inf
+        if self._refines.any():
+            free_dt = min(frame_dt / DEFAULT_SUBSTEPS, ACCURATE_SHARE * self._integrator.stable_dt(self._refines))
+        asking = max(self.parameters, key=lambda cloth: cloth.substeps or 0)
+        if asking.substeps is None:
+            return np.inf, free_dt
+        stable_dt = self._integrator.stable_dt()
+        if min(frame_dt / asking.substeps, free_dt) > stable_dt:
+            raise ValueError(f'cloth "{asking.name}": {too_few_substeps(asking.substeps, frame_dt, stable_dt)}')
+        return frame_dt / asking.substeps, free_dt
 
     # --- what goes out ----------------------------------------------------------------------------------------------
 
@@ -433,10 +450,3 @@ def _runs_without(left_out: Collection[int], count: int) -> list[range]:
     """The numbers 0 ... count - 1 but some, in runs of neighbours."""
     ends = [-1, *sorted(left_out), count]
     return [range(a + 1, b) for a, b in pairwise(ends) if b > a + 1]
-
-
-def _reach(domain: DomainParameters, positions: NDArray[np.float64]) -> float:
-    """How far from the origin, along an axis, cloth may come [m]."""
-    corners = np.concatenate([np.array([domain.min, domain.max]), positions])
-    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    return float(np.abs(corners).max()) + LOST_DISTANCE * diagonal

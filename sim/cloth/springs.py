@@ -20,7 +20,7 @@ spring stands for, half on the border):
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -34,6 +34,7 @@ from sim.cloth.sheet import Grid, RestSheet, triangle_areas
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
+Group = tuple[int, ...]
 
 ALONG_X, ALONG_Y, BEND = range(3)
 """Of a spring: a thread of a rectangle along x or y, or a bend."""
@@ -229,20 +230,20 @@ def edges_of(triangles: Indices) -> Edges:
 
 
 def joined_springs(
-    parts: list[list[Springs]], node_offsets: list[int], *, apart: Collection[int] = ()
+    parts: list[list[Springs]], node_offsets: list[int], *, groups: Sequence[Group] | None = None
 ) -> list[tuple[Springs, Indices]]:
     """Springs of several cloths, those that are solved alike together and sorted by colour, and the cloth of each.
 
     Args:
         parts: the springs of each cloth.
         node_offsets: number of its first node.
-        apart: cloths whose springs are not joined with those of the others.
+        groups: which of each cloth; only springs of cloths of one are joined, those of all if omitted.
     """
-    families: dict[tuple[bool, int, bool], list[tuple[int, Springs]]] = {}
+    families: dict[tuple[Group, int, bool], list[tuple[int, Springs]]] = {}
     for number, cloth in enumerate(parts):
         for springs in cloth:
             if len(springs):
-                key = (number in apart, -springs.arity, springs.in_segments)
+                key = (groups[number] if groups else (), -springs.arity, springs.in_segments)
                 families.setdefault(key, []).append((number, springs))
     joined = []
     for key in sorted(families):
@@ -260,18 +261,18 @@ def joined_springs(
 
 
 def joined_cells(
-    parts: list[Cells], node_offsets: list[int], *, apart: Collection[int] = ()
+    parts: list[Cells], node_offsets: list[int], *, groups: Sequence[Group] | None = None
 ) -> list[tuple[Cells, Indices]]:
     """Cells of several cloths, those with as many nodes together and sorted by colour, and the cloth of each.
 
     Args:
         parts: the cells of each cloth.
         node_offsets: number of its first node.
-        apart: cloths whose cells are not joined with those of the others.
+        groups: as of `joined_springs`.
     """
-    families: dict[tuple[bool, int], list[int]] = {}
+    families: dict[tuple[Group, int], list[int]] = {}
     for number, cells in enumerate(parts):
-        families.setdefault((number in apart, cells.arity), []).append(number)
+        families.setdefault((groups[number] if groups else (), cells.arity), []).append(number)
     joined = []
     for key in sorted(families):
         own = families[key]

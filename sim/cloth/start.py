@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.cloth.parameters import ClothParameters, PinParameters, SphereRegion
 from sim.cloth.sheet import RestSheet, build_sheet
+from sim.core.domain import DomainParameters
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -21,6 +22,15 @@ REGION_MARGIN = 1.0e-6
 TOUCHING = 1.0e-6
 """Elements so near [m] count as meeting: which side of the other one is on is little more than rounding."""
 
+LATTICE_BITS = 30
+"""Positions are whole multiples of a quantum, up to 2^30 of them within reach; twice that is all an int32 holds."""
+
+LOST_DISTANCE = 10.0
+"""Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
+
+COARSEST = 0.25
+"""Most that positions may be rounded to, in thicknesses: contacts do not know which layer is above beyond that."""
+
 PAIRS_AT_ONCE = 1_000_000
 """Pairs of an edge and a triangle that are looked at together, up to 400 MB; more only where one edge has more."""
 
@@ -29,6 +39,35 @@ def start_positions(cloth: ClothParameters, sheet: RestSheet) -> Floats:
     """Where the nodes of a cloth start [m], (n, 3)."""
     turned: Floats = Rotation.from_euler("xyz", cloth.rotation_deg, degrees=True).apply(sheet.vertices)
     return turned + np.asarray(cloth.position)
+
+
+# --- rounding ------------------------------------------------------------------------------------------------------
+
+
+def reach_of(domain: DomainParameters, positions: Floats) -> float:
+    """How far from the origin, along an axis, cloths that start at positions [m], (n, 3), may come [m]."""
+    corners = np.concatenate([np.array([domain.min, domain.max]), positions])
+    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    return float(np.abs(corners).max()) + LOST_DISTANCE * diagonal
+
+
+def quantum_of(reach: float) -> float:
+    """Unit of positions within a reach [m]."""
+    return float(2.0 ** (np.ceil(np.log2(reach)) - LATTICE_BITS))
+
+
+def too_coarse_positions(cloth: ClothParameters, position: Floats, reach: float) -> str | None:
+    """Why positions within a reach [m] are too coarse for a cloth that starts at some [m], (n, 3), or None.
+
+    They are rounded to the quantum, and to float32 where contacts are found.
+    """
+    unit = max(quantum_of(reach), float(np.spacing(np.float32(np.abs(position).max()))))
+    if unit <= COARSEST * cloth.thickness:
+        return None
+    return (
+        f"its positions are rounded to {unit:.2g} m, and its layers keep {cloth.thickness:g} m; make the domain "
+        "smaller, move the scene nearer to the origin, or make the cloth thicker"
+    )
 
 
 # --- pins ----------------------------------------------------------------------------------------------------------

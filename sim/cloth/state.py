@@ -13,12 +13,9 @@ from sim.cloth.bundles import NodeMotion, Nodes, Surface
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet
 from sim.cloth.springs import edges_of
-from sim.cloth.start import start_positions
+from sim.cloth.start import quantum_of, start_positions
 from sim.core.arrays import Vectors
 from sim.core.launch import kernel
-
-LATTICE_BITS = 30
-"""Positions are whole multiples of a quantum, up to 2^30 of them within reach; twice that is all an int32 holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +131,7 @@ class ClothState:
         """
         n = len(host.position)
         self.host = host
-        self.quantum = float(2.0 ** (np.ceil(np.log2(reach)) - LATTICE_BITS))
+        self.quantum = quantum_of(reach)
         self.limit = int(reach / self.quantum)
         self.lattice = ti.Vector.ndarray(3, ti.i32, n)
         self.position = ti.Vector.ndarray(3, ti.f32, n)

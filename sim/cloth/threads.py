@@ -48,7 +48,7 @@ class ThreadSolver:
     """
 
     def __init__(self, springs: DeviceSprings) -> None:
-        self._springs = springs
+        self.springs = springs
         starts = springs.segment_start.to_numpy()
         direction, solved = (ti.Vector.ndarray(3, ti.f32, springs.count) for _ in range(2))
         self._work = ThreadWork(direction, *(ti.ndarray(ti.f32, springs.count) for _ in range(5)), solved)
@@ -68,7 +68,7 @@ class ThreadSolver:
 
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
-        springs = self._springs
+        springs = self.springs
         springs.contract(state.nodes, state.displacement)
         for colour in springs.first_colours:
             arguments = (springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work)
@@ -84,7 +84,7 @@ class ThreadSolver:
         x + beta (u - u*) for displacements u and those of the prediction u*: (M + beta dt² K) (u - u*) = M (u~ - u*)
         with u~ of the fixed directions, where K is the Laplacian of the thread with weights T/|d|.
         """
-        springs = self._springs
+        springs = self.springs
         for colour in springs.first_colours:
             arguments = (springs.on_device, self._pieces, colour, state.nodes, state.motion, dt, self._work)
             if runs_on_gpu():
@@ -94,7 +94,7 @@ class ThreadSolver:
 
     def excess(self, state: ClothState, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
-        springs = self._springs
+        springs = self.springs
         share = self._excess.over(springs.count)
         found = measure_excess(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, share)
         return float(found[0]), int(found[1])

@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from itertools import product
 
+import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from sim.cloth.angular_momentum import AngularMomentumCorrection
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
@@ -61,25 +63,31 @@ class XPBDSprings:
         for number, rectangle in self._rectangles.items():
             rectangle.take_parameters(cloths[number])
 
-    def excess(self, dt: float) -> float:
-        """By how much a spring of threads and edges is longer than its tension makes it, at most [rest lengths]."""
-        found = [threads.excess(self._state, dt) for threads in self._threads]
-        found += [rectangle.excess(dt) for rectangle in self._rectangles.values()]
+    def excess(self, dt: float) -> NDArray[np.float64]:
+        """By how much a spring of threads and edges is longer than its tension makes it, at most [rest lengths].
+
+        Of each cloth; those that are solved in the same lists have the same.
+        """
+        found = [(threads.springs.cloths, *threads.excess(self._state, dt)) for threads in self._threads]
+        found += [({number}, *rectangle.excess(dt)) for number, rectangle in self._rectangles.items()]
         for cells in self._solved_cells:
             if cells.arity == TRIANGLE:
                 share = self._of_cells.over(cells.count)
                 result = measure_cell_excess(
                     cells.on_device, cells.count, cells.multiplier, self._state.nodes, dt * dt, share
                 )
-                found.append((float(result[0]), int(result[1])))
-        self._unconverged = sum(count for _, count in found)
-        return max((largest for largest, _ in found), default=0.0)
+                found.append((cells.cloths, float(result[0]), int(result[1])))
+        self._unconverged = sum(count for *_, count in found)
+        largest = np.zeros(len(self._state.names))
+        for cloths, excess, _ in found:
+            largest[list(cloths)] = np.maximum(largest[list(cloths)], excess)
+        return largest
 
     def diagnostics(self) -> Mapping[str, float]:
         """`overlong_springs`: at the end of the frame, along the threads of rectangles and the edges of meshes."""
         return {"overlong_springs": float(self._unconverged)}
 
-    def stable_dt(self) -> float:
+    def stable_dt(self, cloths: NDArray[np.bool_] | None = None) -> float:  # noqa: ARG002  (the integrators' protocol)
         """Any step is stable [s]."""
         return float("inf")
 
@@ -112,26 +120,34 @@ class XPBDSprings:
                         cells.on_device, cells.cell_of_colour, colour, state.nodes, state.motion, dt, cells.arity
                     )
 
-    def displace(self, dt: float, sweeps: int) -> None:
-        """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps."""
+    def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
+        """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
         for springs in self._bends:
             self._solve_bends(springs, dt)
-        for sweep in range(sweeps):
-            self._sweep_lists(self._solved_cells, dt, is_first=sweep == 0)
+        for sweep in range(sweeps.max()):
+            self._sweep_lists(self._solved_cells, dt, sweeps > sweep, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
-        for rectangle in self._rectangles.values():
-            rectangle.displace(dt, sweeps)
+        for number, rectangle in self._rectangles.items():
+            rectangle.displace(dt, int(sweeps[number]))
         self._momentum.restore(dt)
 
-    def sweep(self, dt: float) -> None:
-        """Solve what bears tension once more, after contacts have pushed: threads, and the triangles of meshes."""
-        self._sweep_lists([cells for cells in self._solved_cells if cells.arity == TRIANGLE], dt, is_first=False)
-        for rectangle in self._rectangles.values():
-            rectangle.sweep(dt)
+    def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
+        """Solve what bears tension in some cloths once more, after contacts have pushed: threads, and the triangles of
+        meshes."""
+        triangles = [cells for cells in self._solved_cells if cells.arity == TRIANGLE]
+        self._sweep_lists(triangles, dt, cloths, is_first=False)
+        for number, rectangle in self._rectangles.items():
+            if cloths[number]:
+                rectangle.sweep(dt)
 
-    def _sweep_lists(self, solved: Sequence[DeviceCells], dt: float, *, is_first: bool) -> None:
+    def _sweep_lists(
+        self, solved: Sequence[DeviceCells], dt: float, cloths: NDArray[np.bool_], *, is_first: bool
+    ) -> None:
+        """Lists hold only cloths that take the same sweeps."""
         for cells in solved:
+            if not cloths[list(cells.cloths)].any():
+                continue
             sweeps = 1 if cells.arity == TRIANGLE else SHEAR_SWEEPS
             for time, colour in product(range(sweeps), cells.first_colours):
                 solve_cells(
@@ -145,7 +161,8 @@ class XPBDSprings:
                     cells.arity,
                 )
         for threads in self._threads:
-            threads.displace(self._state, dt, is_first=is_first)
+            if cloths[list(threads.springs.cloths)].any():
+                threads.displace(self._state, dt, is_first=is_first)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
         state = self._state

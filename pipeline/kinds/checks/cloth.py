@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
@@ -21,7 +22,7 @@ from sim.cloth.cells import cells_of
 from sim.cloth.parameters import RUNAWAY_SPEED, ClothParameters, RectangleSheet, shared_conflicts
 from sim.cloth.springs import springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, longest_explicit_step, too_few_substeps
-from sim.cloth.start import TOUCHING, first_crossing
+from sim.cloth.start import TOUCHING, first_crossing, reach_of, too_coarse_positions
 from sim.core.domain import DomainParameters
 from sim.core.world import MAX_SUBSTEPS_PER_FRAME
 from sim.shapes.parameters import MeshShape
@@ -31,6 +32,10 @@ from sim.shapes.solid import Solid
 VAST = 20.0
 # Depth in a body of cloth that is laid onto it, in decimal numbers [m].
 ROUND_OFF = 1.0e-6
+# Nodes within the thickness of one, on average; each pair has some seven contacts.
+MOST_NEIGHBOURS = 300
+# Triangles that are divided further to find what they reach into.
+MOST_DIVIDED = 100_000
 # Substeps of explicit springs in a frame: 150 times as many as XPBD takes.
 MANY_SUBSTEPS = 3000
 
@@ -44,18 +49,21 @@ def check_cloths(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         _check_speeds(("cloth", number), cloth, findings)
         _check_wind_in_smoke(job, ("cloth", number), cloth, findings)
     starts = start_cloths(job, budget, findings)
+    reach = reach_of(job.domain, np.concatenate([np.zeros((0, 3)), *(start.position for start in starts)]))
     for number, start in enumerate(starts):
         _check_place(start, job.domain, findings)
+        if reason := too_coarse_positions(start.cloth, start.position, reach):
+            findings.error(start.path, reason)
         _check_size(start, job.domain, findings)
         _check_spacing(start, findings)
-        check_pin_speeds(start, job.fps, findings)
+        check_pin_speeds(start, job, findings)
         check_pin_load(start, job, fluid_over(job, solids, start.box), findings)
         check_buoyancy(job, start.path, start.cloth, findings)
-        _check_substeps(start, job.fps, findings)
         for path, solid in solids.items():
             if path[0] == "rigid":
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
         _check_crossings(start, starts[:number], findings)
+    _check_substeps([start for start in starts if start.cloth.integrator == "explicit"], job.fps, findings)
     if starts:
         check_bodies_for_cloth(job, solids, starts, findings)
     return sum(len(start.position) for start in starts)
@@ -113,20 +121,54 @@ def _check_size(start: ClothStart, domain: DomainParameters, findings: Findings)
 
 def _check_spacing(start: ClothStart, findings: Findings) -> None:
     """Layers keep the thickness where the sheet is folded; it cannot fold more sharply than its nodes allow."""
-    shortest = start.shortest_edge
-    if start.cloth.self_collision and start.cloth.thickness > shortest:
+    shortest, thickness = start.shortest_edge, start.cloth.thickness
+    if not start.cloth.self_collision or thickness <= shortest:
+        return
+    tree = cKDTree(start.sheet.vertices)
+    neighbours = float(tree.count_neighbors(tree, thickness)) / len(start.position) - 1.0
+    if neighbours > MOST_NEIGHBOURS:
+        mean = math.sqrt(float(start.sheet.node_area.mean()))
+        findings.error(
+            (*start.path, "thickness"),
+            f"{thickness:g} m is so much more than the {mean:.3g} m between nodes that {neighbours:.0f} of them are "
+            f"within it of each, {MOST_NEIGHBOURS} at most; make it thinner, the sheet coarser, or use "
+            "self_collision = false",
+        )
+    else:
         findings.warn(
             (*start.path, "thickness"),
-            f"{start.cloth.thickness:g} m is more than the {shortest:.3g} m between neighbouring nodes: every node is "
+            f"{thickness:g} m is more than the {shortest:.3g} m between neighbouring nodes: every node is "
             "in contact with many others, which takes long; make it thinner, or the sheet coarser",
         )
 
 
-def _check_substeps(start: ClothStart, fps: int, findings: Findings) -> None:
-    """Explicit springs are unstable beyond their step, and without a number of substeps dictate theirs."""
+def _check_substeps(starts: Sequence[ClothStart], fps: int, findings: Findings) -> None:
+    """Explicit springs are unstable beyond their step, and without a number of substeps dictate theirs.
+
+    Cloths step together, as often as the one that takes most.
+    """
+    longest = [_longest_step(start) for start in starts]
+    taken = [
+        start.cloth.substeps or math.ceil(1.0 / (fps * ACCURATE_SHARE * step))
+        for start, step in zip(starts, longest, strict=True)
+    ]
+    for start, step, substeps in zip(starts, longest, taken, strict=True):
+        if start.cloth.substeps is not None:
+            if reason := too_few_substeps(max(taken), 1.0 / fps, step):
+                findings.error((*start.path, "substeps"), reason)
+            continue
+        takes = f'"explicit" takes {count(substeps)} substeps a frame of springs of this stiffness and mass'
+        helps = 'give a softer stretch_stiffness or a coarser sheet, or use "xpbd"'
+        if substeps > MAX_SUBSTEPS_PER_FRAME:
+            most = count(MAX_SUBSTEPS_PER_FRAME)
+            findings.error((*start.path, "integrator"), f"{takes}, more than the {most} at which a run ends: {helps}")
+        elif substeps > MANY_SUBSTEPS:
+            findings.warn((*start.path, "integrator"), f"{takes}, which takes long: {helps}")
+
+
+def _longest_step(start: ClothStart) -> float:
+    """Longest step that is stable for the explicit springs of a cloth [s]."""
     cloth = start.cloth
-    if cloth.integrator != "explicit":
-        return
     families = [
         (springs, (1.0 + cloth.poisson_ratio) * springs.stiffness(cloth), springs.damping(cloth))
         for springs in springs_of(start.sheet)
@@ -134,38 +176,40 @@ def _check_substeps(start: ClothStart, fps: int, findings: Findings) -> None:
     # Nodes that are released later need shorter steps from then on.
     inverse_mass = np.where(start.held_for_ever, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
     cells = cells_of(start.sheet)
-    longest = longest_explicit_step(families, [(cells, cells.law(cloth))], inverse_mass)
-    if cloth.substeps is not None:
-        if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest):
-            findings.error((*start.path, "substeps"), reason)
-        return
-    substeps = math.ceil(1.0 / (fps * ACCURATE_SHARE * longest))
-    takes = f'"explicit" takes {count(substeps)} substeps a frame of springs of this stiffness and mass'
-    helps = 'give a softer stretch_stiffness or a coarser sheet, or use "xpbd"'
-    if substeps > MAX_SUBSTEPS_PER_FRAME:
-        most = count(MAX_SUBSTEPS_PER_FRAME)
-        findings.error((*start.path, "integrator"), f"{takes}, more than the {most} at which a run ends: {helps}")
-    elif substeps > MANY_SUBSTEPS:
-        findings.warn((*start.path, "integrator"), f"{takes}, which takes long: {helps}")
+    return longest_explicit_step(families, [(cells, cells.law(cloth))], inverse_mass)
 
 
 def _check_inside(start: ClothStart, body: str, solid: Solid, findings: Findings) -> None:
     """Refuse cloth in a body: nobody knows which way out is meant. Pinned nodes stay where they are, so they may be."""
     if not touch(start.box, solid.bounds, margin=0.0):
         return
-    points = np.concatenate(
-        [start.position[~start.held], *(_middles(start, parts) for parts in (start.edges, start.sheet.triangles))]
-    )
+    free = [start.position[parts[~start.held[parts].any(axis=1)]] for parts in (start.edges, start.sheet.triangles)]
+    points = np.concatenate([start.position[~start.held], free[0].mean(axis=1)])
     points = points[((points >= solid.bounds[0]) & (points <= solid.bounds[1])).all(axis=1)]
     inside = points[solid.signed_distance(points) < -ROUND_OFF] if len(points) else points
+    if not len(inside):
+        inside = _points_inside(free[1][_reaching(free[1], solid.bounds)], solid, finest=start.cloth.thickness)
     if len(inside):
         findings.error(start.path, f'starts inside "{body}", as at {_place(inside[0])}; move one of them')
 
 
-def _middles(start: ClothStart, parts: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Middles of edges or triangles [m] without a pinned node."""
-    middles: NDArray[np.float64] = start.position[parts[~start.held[parts].any(axis=1)]].mean(axis=1)
-    return middles
+def _points_inside(triangles: NDArray[np.float64], solid: Solid, *, finest: float) -> NDArray[np.float64]:
+    """Middles of triangles (m, 3, 3), or of parts of them down to the `finest` [m], in a solid [m], (n, 3).
+
+    Parts whose middle is farther off than their corners are from it cannot reach into the solid.
+    """
+    while len(triangles):
+        middle = triangles.mean(axis=1)
+        distance = solid.signed_distance(middle)
+        radius = np.linalg.norm(triangles - middle[:, None], axis=2).max(axis=1)
+        parts = triangles[(distance < radius) & (radius > finest)]
+        if (distance < -ROUND_OFF).any() or len(parts) > MOST_DIVIDED:
+            inside: NDArray[np.float64] = middle[distance < -ROUND_OFF]
+            return inside
+        half = 0.5 * (parts + np.roll(parts, -1, axis=1))  # the middles of the sides from each corner on
+        corners = [np.stack([parts[:, k], half[:, k], half[:, k - 1]], axis=1) for k in range(3)]
+        triangles = np.concatenate([half, *corners])
+    return np.zeros((0, 3))
 
 
 def _check_crossings(start: ClothStart, earlier: Sequence[ClothStart], findings: Findings) -> None:

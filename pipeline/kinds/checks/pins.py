@@ -8,7 +8,7 @@ from pipeline.kinds.checks.cloth_start import ClothStart
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
+from sim.cloth.parameters import ClothParameters, substeps_of
 from sim.cloth.pin_paths import path_of_pin
 
 SOFTEST, FIRM = 1.0, 0.5
@@ -38,7 +38,7 @@ def check_pin_times(path: KeyPath, cloth: ClothParameters, film_s: float, findin
             )
 
 
-def check_pin_speeds(start: ClothStart, fps: int, findings: Findings) -> None:
+def check_pin_speeds(start: ClothStart, job: Job, findings: Findings) -> None:
     """Warn of a pin that pulls its nodes further in a substep than the next node is away.
 
     Explicit springs whose substeps are omitted take as many as their stiffness asks for, which are not known here.
@@ -52,7 +52,7 @@ def check_pin_speeds(start: ClothStart, fps: int, findings: Findings) -> None:
             continue
         reach = float(np.linalg.norm(position - position.mean(axis=0), axis=1).max())
         speed = path_of_pin(pin).largest_speed(reach)
-        moved = speed / (fps * (cloth.substeps or DEFAULT_SUBSTEPS))
+        moved = speed / (job.fps * substeps_of(job.cloth))
         if moved > start.longest_edge:
             findings.warn(
                 (*start.path, "pin", number, "keyframe"),
@@ -71,7 +71,7 @@ def check_pin_load(start: ClothStart, job: Job, fluid_mass: float, findings: Fin
     if cloth.integrator != "xpbd" or not pinned:
         return
     fluid_share = fluid_mass / (float(start.sheet.node_area.sum()) * cloth.mass_per_area)
-    substeps = cloth.substeps or DEFAULT_SUBSTEPS
+    substeps = substeps_of(job.cloth)
     fall = math.hypot(*job.gravity) / (job.fps * substeps) ** 2
     softness = (1.0 + fluid_share) * nodes / pinned * fall / (cloth.iterations or 1) / start.shortest_edge
     if softness > SOFTEST:

@@ -15,7 +15,7 @@ from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
 from pipeline.web.live.frame_cost import cloth_frame_s, fewest_for_bodies, frame_s, steps_a_frame
 from pipeline.web.live.parameters import parameters_of
-from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
+from sim.cloth.parameters import ClothParameters, substeps_of
 
 GPU_CORES = 20
 """Cores that a GPU counts as: scenes that fit here are too small to fill it."""
@@ -83,7 +83,7 @@ def require_small(job: Job, particles: int, *, cores: int, on_gpu: bool) -> None
     sizes, remedies = [], []
     if nodes:
         for_bodies = fewest_for_bodies(job)
-        substeps = max(job.cloth[0].substeps or DEFAULT_SUBSTEPS, for_bodies)
+        substeps = max(substeps_of(job.cloth), for_bodies)
         sizes.append(f"{nodes:,} cloth nodes at {substeps} substeps a frame")
         remedies.append(f"about {int(nodes * share):,} nodes fit")
         fitting = int(substeps * share)
@@ -125,7 +125,7 @@ def fluent(job: Job, *, power: float) -> Job:
 def _in_fewer_substeps(job: Job, fewest: int, *, power: float) -> Job:
     """The job in as many substeps as are fluent, but no more than it has, and no fewer than that many, or than its
     bodies ask for."""
-    substeps, for_bodies = job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job)
+    substeps, for_bodies = substeps_of(job.cloth), fewest_for_bodies(job)
     fitting = int(max(substeps, for_bodies) * fluent_frame_s(job) / cloth_frame_s(job, power=power))
     count = min(substeps, max(fitting, fewest, for_bodies))
     return job.model_copy(update={"cloth": with_substeps(job.cloth, count)})

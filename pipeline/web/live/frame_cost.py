@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.kinds.checks.steps import stable_dt
 from pipeline.kinds.cloth import count_cloth_nodes
 from pipeline.model.job import Job
-from sim.cloth.parameters import DEFAULT_SUBSTEPS
+from sim.cloth.parameters import substeps_of
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.traits import TRAITS, VISCOUS_NUMBER
 
@@ -37,7 +37,7 @@ def cloth_frame_s(job: Job, *, power: float) -> float:
     """Time that a frame of the cloths takes [s], on as many cores as `power`."""
     if not job.cloth:
         return 0.0
-    substeps = max(job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job))
+    substeps = max(substeps_of(job.cloth), fewest_for_bodies(job))
     meets = any(cloth.self_collision for cloth in job.cloth) or len(job.cloth) > 1
     return count_cloth_nodes(job) * substeps * NODE_SUBSTEP_S * (1.0 if meets else APART_SHARE) / power
 

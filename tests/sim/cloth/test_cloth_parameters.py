@@ -71,7 +71,8 @@ def test_cloths_that_step_differently_cannot_share_a_scene():
     (conflict,) = shared_conflicts((cloth("a"), cloth("b", integrator="explicit")))
     assert conflict[:2] == (1, "integrator")
     assert "all cloths share it" in conflict[2]
-    assert shared_conflicts((cloth("a"), cloth("b", shape=rectangle((1, 1), (3, 3))))) == []
+    others = {"shape": rectangle((1, 1), (3, 3)), "substeps": 40, "iterations": 3}
+    assert shared_conflicts((cloth("a"), cloth("b", **others))) == []
 
 
 @pytest.mark.parametrize("material", [{"a": 1}, ["cotton"], 3, "chiffon", None])

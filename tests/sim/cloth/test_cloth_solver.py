@@ -270,9 +270,9 @@ def test_a_node_that_runs_away_is_found():
     assert solver.first_bad_quantity() == "max_speed is 2e+04 m/s"
 
 
-def test_cloths_with_other_substeps_are_refused():
-    with pytest.raises(ValueError, match='cloth "b": substeps is 30, but omitted in cloth'):
-        solver_of(cloth("a"), cloth("b", substeps=30))
+def test_cloths_with_other_integrators_are_refused():
+    with pytest.raises(ValueError, match='cloth "b": integrator is "explicit", but "xpbd" in cloth'):
+        solver_of(cloth("a"), cloth("b", integrator="explicit"))
 
 
 def test_cloth_as_the_name_of_a_fluid_is_refused():

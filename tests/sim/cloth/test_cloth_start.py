@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sim.build import build_world
+from sim.cloth.continuous_contacts import RECOVERY_TIME_S
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import edges_of
@@ -145,3 +146,41 @@ def test_an_edge_may_be_pinned_inside_a_post_but_not_start_there_free():
     held = before[:, 0] < 0.01
     np.testing.assert_array_equal(after[held], before[held])
     assert (after[~held, 2] < before[~held, 2]).any()
+
+
+def test_a_scene_whose_positions_are_too_coarse_for_the_cloth_is_refused():
+    """In a domain of 100 km they were rounded to 4 mm, and layers 0.5 mm apart crossed; far off float32 does it."""
+    sheet = {"name": "flag", "shape": {"type": "rectangle", "size": (0.4, 0.3), "counts": (5, 4)}}
+    far = {**sheet, "position": (1.0e4, 0.0, 0.5)}
+    near_far = {"min": (9999.0, -1.0, 0.0), "max": (1.0e4 + 1.0, 1.0, 1.0)}
+    for cloth, domain, unit in ((sheet, {"min": (-1.0e5, -1.0, 0.0)}, "0.002"), (far, near_far, "0.00098")):
+        scene = SceneParameters.model_validate({"cloth": (cloth,), "domain": domain})
+        with pytest.raises(ValueError, match=rf'cloth "flag": its positions are rounded to {unit} m, and its layers'):
+            build_world(scene, frames_per_second=60)
+
+
+@pytest.mark.usefixtures("taichi_cpu")
+@pytest.mark.parametrize("thickness", [0.5e-3, 5.0e-3])
+def test_layers_that_start_nearer_than_their_thickness_are_pushed_apart_gently(thickness):
+    """Weightless sheets a hundredth of a thickness apart, one over the other and on a floor."""
+    sheet = {"shape": {"type": "rectangle", "size": (0.2, 0.2), "counts": (11, 11)}, "thickness": thickness}
+    cloths = [
+        {
+            **sheet,
+            "name": f"layer{k}",
+            "position": (0.0, 0.0, 0.01 * k * thickness),
+            "rotation_deg": (0.0, 0.0, 7.0 * k),
+        }
+        for k in range(4)
+    ]
+    scene = {"cloth": cloths, "gravity": (0.0, 0.0, 0.0), "domain": {"max": (0.5, 0.5, 10.0)}}
+    world, speeds = build_world(SceneParameters.model_validate(scene), frames_per_second=60), []
+    solver = world.solvers["cloth"]
+    world.watch = lambda: speeds.append(float(np.abs(solver.state.velocity.to_numpy()).max()))
+    for _ in range(6):
+        numbers = world.advance_frame().diagnostics["cloth"]
+        assert numbers["crossings_left"] == 0.0
+    assert 0.0 < max(speeds) < 4 * thickness / RECOVERY_TIME_S
+    heights = solver.state.positions()[:, 2].reshape(4, -1)
+    assert len(crossings(solver.state.positions(), solver.state.host.triangles)) == 0
+    assert (np.diff(heights.mean(axis=1)) > 0.9 * thickness).all()

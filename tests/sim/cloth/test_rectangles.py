@@ -55,7 +55,7 @@ def test_rows_and_lists_move_nodes_to_the_same_places(counts, iterations, poisso
     before = lists.state.displacement.to_numpy()
     np.testing.assert_allclose(rows.state.displacement.to_numpy(), before, rtol=0.0, atol=1e-8)
     for solver in (rows, lists):
-        solver._integrator.displace(solver.stable_dt(), iterations)
+        solver._integrator.displace(solver.stable_dt(), np.full(len(solver.parameters), iterations))
     moved = np.abs(lists.state.displacement.to_numpy() - before).max()
     difference = np.abs(rows.state.displacement.to_numpy() - lists.state.displacement.to_numpy()).max()
     assert moved > 0.1 * spacing
@@ -72,7 +72,7 @@ def test_tension_is_straightened_in_rows_as_in_lists(monkeypatch):
         positions[:, 2] += 0.002 * np.sin(np.arange(len(positions)) % 90)
         solver.state.set_positions(positions)
         solver._predict(solver.stable_dt())
-        solver._integrator.displace(solver.stable_dt(), 1)
+        solver._integrator.displace(solver.stable_dt(), np.ones(len(solver.parameters), dtype=int))
     assert lists._integrator._threads[0]._pieces.is_taut.to_numpy().any()
     moved = lists.state.displacement.to_numpy()
     difference = np.abs(rows.state.displacement.to_numpy() - moved).max()

@@ -46,6 +46,19 @@ KEYFRAMES = "keyframe = [{ time_s = 0.0 }, { time_s = 1.0, offset = [0.1, 0.0, 0
             '4 cloth[0]: starts inside "ball", as at (0.03333, 0.01667, 0.5) m',
         ),
         (
+            # Thinner still, and beside the middle: a needle.
+            SHEET + BALL.replace("radius = 0.1", "radius = 0.004").replace("0.0, 0.0, 0.3]", "0.04, 0.005, 0.5]"),
+            '4 cloth[0]: starts inside "ball", as at (0.04',
+        ),
+        (
+            SHEET.replace("[9, 9]", "[21, 21]") + "thickness = 0.6",
+            "8 cloth[0].thickness: 0.6 m is so much more than the 0.019 m ... that 440 of ... 300 at most; make it",
+        ),
+        (
+            SHEET.replace("[domain]", "[domain]\nmax = [1e5, 1e5, 1e5]"),
+            "5 cloth[0]: its positions are rounded to 0.002 m, and its layers keep 0.0005 m; make the domain smaller",
+        ),
+        (
             SHEET + SECOND + "rotation_deg = [0.0, 90.0, 0.0]",
             '9 cloth[1]: passes through or touches cloth "sheet" at (0.03, -0.15, 0.5) m ... 0.0005 m or more apart',
         ),
@@ -64,8 +77,8 @@ KEYFRAMES = "keyframe = [{ time_s = 0.0 }, { time_s = 1.0, offset = [0.1, 0.0, 0
             "10 cloth[0].pin[1]: shares a node with pin[0], and one of them moves",
         ),
         (
-            SHEET + SECOND.replace("0.5]", "0.7]") + "substeps = 40",
-            "13 cloth[1].substeps: is 40 ... in cloth[0]",
+            SHEET + SECOND.replace("0.5]", "0.7]") + 'integrator = "explicit"',
+            '13 cloth[1].integrator: is "explicit", but "xpbd" in cloth[0]',
         ),
         (
             SHEET.replace('"rectangle", size = [0.4, 0.4], counts = [9, 9]', '"mesh", file = "shawl.ply"'),
@@ -175,6 +188,18 @@ def test_too_few_substeps_for_explicit_springs_are_refused_with_a_number_that_is
     least = int(re.search(place + r".* give substeps = (\d+) or more", problem)[1])
     assert problems(least) == []
     assert len(problems(least - 1)) == 1
+
+
+def test_explicit_springs_may_ask_for_too_few_substeps_beside_others_that_take_enough(tmp_path):
+    """As cloths step together, as often as the one that takes most; it omits them or gives them."""
+    sheet = f'{SHEET}integrator = "explicit"\nsubsteps = 2\n'
+    other = SECOND.replace("0.5]", "0.7]") + 'integrator = "explicit"\n'
+    assert errors(f"{sheet}{other}", tmp_path) == errors(f"{sheet}{other}substeps = 4000", tmp_path) == []
+    found = errors(f"{sheet}{other}substeps = 3", tmp_path)
+    assert [re.sub(r".*(cloth.*: \d+ substeps a frame) are.*", r"\1", problem) for problem in found] == [
+        "cloth[0].substeps: 3 substeps a frame",
+        "cloth[1].substeps: 3 substeps a frame",
+    ]
 
 
 def test_explicit_springs_without_substeps_are_told_how_many_they_take(tmp_path):
