@@ -75,6 +75,48 @@ class CellArrays(NamedTuple):
 
 
 @bundle
+class MeshNodes(NamedTuple):
+    """Nodes of triangles, o of them, piece by piece; chunks of about as many nodes as there are chunks."""
+
+    node: Integers  # number, (o,)
+    start: Integers  # of each node in `corner`, (o + 1,)
+    corner: Integers  # corner a of triangle s is 3 s + a
+    piece: Integers  # (o,)
+    chunk: Integers  # first node of each chunk, and o
+    first_chunk: Integers  # of each piece, and number of chunks
+
+
+@bundle
+class TriangleFrames(NamedTuple):
+    """Along which triangles push in a step, (s,) each."""
+
+    n_u: Vectors  # direction of the warp
+    n_v: Vectors
+    by_u: Vectors  # derivatives of the shear
+    by_v: Vectors
+    turning: Weights  # tension over length that turns with warp, weft, their sum and difference [J]
+
+
+@bundle
+class TriangleWork(NamedTuple):
+    """Numbers of conjugate gradients, (s,) and (n,)."""
+
+    s_u: Vectors  # forces along d_u and d_v [J], (s,)
+    s_v: Vectors
+    x: Vectors  # solution [m], (n,)
+    r: Vectors  # residual [kg m]
+    z: Vectors  # preconditioned residual [m]
+    a_z: Vectors  # matrix times that [kg m]
+    p: Vectors  # direction of the search [m]
+    q: Vectors  # matrix times that [kg m]
+    diagonal: Vectors  # of the inverse blocks [1/kg]
+    off_diagonal: Vectors  # their yz, xz and xy
+    scalars: Floats  # decrease by the start, then gamma and alpha of each iteration
+    moment: Weights  # of each chunk [kg m], and mass [kg]
+    shift: Vectors  # of each piece [m]
+
+
+@bundle
 class Contraction(NamedTuple):
     """How springs of threads feel the strain across."""
 

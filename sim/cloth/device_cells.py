@@ -10,7 +10,6 @@ from sim.cloth.bundles import CellArrays, NodeMotion, Nodes
 from sim.cloth.cells import STRAINS, TRIANGLE, Cells, energies
 from sim.cloth.device_springs import TINY_LENGTH, colour_bounds, colour_groups
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.spring_convergence import LARGEST_RESIDUAL
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
@@ -28,7 +27,7 @@ class DeviceCells:
         cloths: numbers of the cloths that they belong to.
         first_colours: first colour of each group of `COLOURS_AT_ONCE`; the last group may have empty ones.
         cell_of_colour: first cell of each colour, and number of cells, (colours + 1,).
-        multiplier: of each strain, (count * STRAINS,).
+        multiplier: of the shear of rectangles, or what triangles expect as |d_u| and |d_v|, (count * STRAINS,).
     """
 
     def __init__(self, cells: Cells, cloth_of: NDArray[np.int32]) -> None:
@@ -141,39 +140,17 @@ def solve_cell(
     multiplier: Floats,
     arity: ti.template(),
 ):
-    """Strain by strain, Macklin, Müller & Chentanez 2016, eq. 18, multiplied through by k dt².
-
-    With nu times the strain across, warp and weft have the tension C (e_u + nu e_v): each takes the other as it is.
-    """
+    """The shear, by Macklin, Müller & Chentanez 2016, eq. 18, multiplied through by k dt²."""
     d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, arity)
     d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, arity)
     w = weights(cells, nodes, s, arity)
-    p_u, p_v = ti.math.vec3(0.0), ti.math.vec3(0.0)
     law = cells.law[s]
-    if ti.static(arity == TRIANGLE):
-        strength = law[0] * dt_squared
-        length, length_across = ti.max(d_u.norm(), TINY_LENGTH), d_v.norm()
-        before = ti.select(is_first, 0.0, multiplier[STRAINS * s])
-        strain = length - 1.0 + law[2] * (length_across - 1.0)
-        change = -(strength * strain + before) / (strength * w[0] + 1.0)
-        multiplier[STRAINS * s] = before + change
-        p_u = change / length * d_u
-        d_v += w[2] * p_u
-        d_u += w[0] * p_u
-        length, length_across = d_u.norm(), ti.max(d_v.norm(), TINY_LENGTH)
-        before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 1])
-        strain = length_across - 1.0 + law[2] * (length - 1.0)
-        change = -(strength * strain + before) / (strength * w[1] + 1.0)
-        multiplier[STRAINS * s + 1] = before + change
-        p_v = change / length_across * d_v
-        d_u += w[2] * p_v
-        d_v += w[1] * p_v
     shear, by_u, by_v = shear_of(d_u, d_v)
     strength, weight = law[1] * dt_squared, weight_along(by_u, by_v, w)
     before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 2])
     change = -(strength * shear + before) / (strength * weight + 1.0)
     multiplier[STRAINS * s + 2] = before + change
-    push_nodes(s, cells, nodes, p_u + change * by_u, p_v + change * by_v, nodes.displacement, arity)
+    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.displacement, arity)
 
 
 @kernel
@@ -267,36 +244,6 @@ def compute_cell_forces(
             f_v -= law[0] * (e_v + law[2] * e_u) * n_v
         force[first + 2 * s] = f_u
         force[first + 2 * s + 1] = f_v
-
-
-@kernel
-def measure_cell_excess(
-    cells: CellArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, share: Share
-) -> Results:
-    """Largest excess of triangles along warp and weft, as `spring_convergence` has it, and how many of both are beyond
-    `LARGEST_RESIDUAL`.
-    """
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
-        largest, unconverged = 0.0, 0.0
-        for k in range(share.items):
-            s = lane * share.lane_step + k * share.item_step
-            if s < count:
-                e_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
-                e_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
-                law = cells.law[s]
-                w = weights(cells, nodes, s, TRIANGLE)
-                if w[0] > 0.0:
-                    excess = e_u + law[2] * e_v + multiplier[STRAINS * s] / (law[0] * dt_squared)
-                    across = e_v + law[2] * e_u + multiplier[STRAINS * s + 1] / (law[0] * dt_squared)
-                    largest = ti.max(largest, excess, across)
-                    if excess > LARGEST_RESIDUAL:
-                        unconverged += 1.0
-                    if across > LARGEST_RESIDUAL:
-                        unconverged += 1.0
-        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
-    return reduced_tree(share.tree)
 
 
 @kernel

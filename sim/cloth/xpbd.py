@@ -7,16 +7,16 @@ import taichi as ti
 from sim.cloth.angular_momentum import AngularMomentumCorrection
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
-from sim.cloth.device_cells import DeviceCells, damp_cells, measure_cell_excess, solve_cells
+from sim.cloth.device_cells import DeviceCells, damp_cells, solve_cells
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
+from sim.cloth.triangles import TriangleSolver
 from sim.core.arrays import Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import LaneReduction
 
 PAIR, BEND_OF_GRID = 2, 3
 """Nodes of springs: of an ordinary one, and of one over a node of a rectangle, which is flat at rest."""
@@ -45,32 +45,30 @@ class XPBDSprings:
         self._state, self._springs, self._cells = state, springs, cells
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
-        self._of_cells = LaneReduction(maxima=1, sums=1)
         self._rectangles = {
             number: RectangleSprings(state, grid, int(state.host.first_node[number]))
             for number, grid in rectangles_in_rows(state.host).items()
         }
         listed = [family for family in springs if not family.cloths & self._rectangles.keys()]
         self._bends = [family for family in listed if family.arity > PAIR]
-        self._solved_cells = [family for family in cells if not family.cloths & self._rectangles.keys()]
+        self._shears = [
+            family for family in cells if family.arity != TRIANGLE and not family.cloths & self._rectangles.keys()
+        ]
+        self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
         self._threads = [ThreadSolver(family) for family in listed if family.in_segments]
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
-        """Stiffness of the rectangles as it is now; lists of springs hold theirs."""
+        """Stiffness of rectangles and mass of meshes as they are now; lists of springs hold their stiffness."""
         for number, rectangle in self._rectangles.items():
             rectangle.take_parameters(cloths[number])
+        for triangles in self._triangles:
+            triangles.take_parameters()
 
     def excess(self, dt: float) -> float:
         """By how much a spring of threads and edges is longer than its tension makes it, at most [rest lengths]."""
         found = [threads.excess(self._state, dt) for threads in self._threads]
         found += [rectangle.excess(dt) for rectangle in self._rectangles.values()]
-        for cells in self._solved_cells:
-            if cells.arity == TRIANGLE:
-                share = self._of_cells.over(cells.count)
-                result = measure_cell_excess(
-                    cells.on_device, cells.count, cells.multiplier, self._state.nodes, dt * dt, share
-                )
-                found.append((float(result[0]), int(result[1])))
+        found += [triangles.excess() for triangles in self._triangles]
         self._unconverged = sum(count for _, count in found)
         return max((largest for largest, _ in found), default=0.0)
 
@@ -116,7 +114,7 @@ class XPBDSprings:
         for springs in self._bends:
             self._solve_bends(springs, dt)
         for sweep in range(sweeps):
-            self._sweep_lists(self._solved_cells, dt, is_first=sweep == 0)
+            self._sweep_lists(self._shears, dt, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
         for rectangle in self._rectangles.values():
@@ -125,7 +123,7 @@ class XPBDSprings:
 
     def sweep(self, dt: float) -> None:
         """Solve what bears tension once more, after contacts have pushed: threads, and the triangles of meshes."""
-        self._sweep_lists([cells for cells in self._solved_cells if cells.arity == TRIANGLE], dt, is_first=False)
+        self._sweep_lists([], dt, is_first=False)
         for rectangle in self._rectangles.values():
             rectangle.sweep(dt)
 
@@ -144,6 +142,8 @@ class XPBDSprings:
                 )
         for threads in self._threads:
             threads.displace(self._state, dt, is_first=is_first)
+        for triangles in self._triangles:
+            triangles.displace(dt, is_first=is_first)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
         state = self._state

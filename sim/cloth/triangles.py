@@ -1,0 +1,513 @@
+"""Triangles of meshes, solved together in every step: one Newton step of implicit Euler by conjugate gradients."""
+
+from itertools import pairwise
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, TriangleFrames, TriangleWork
+from sim.cloth.cells import STRAINS, TRIANGLE
+from sim.cloth.device_cells import DeviceCells, derivative, shear_of
+from sim.cloth.device_springs import TINY_LENGTH
+from sim.cloth.loop_costs import NODE_OF_MESH_NS, TRIANGLE_NS
+from sim.cloth.spring_convergence import LARGEST_RESIDUAL
+from sim.cloth.state import ClothState
+from sim.cloth.threads import STRAIGHTENED, direction_of
+from sim.core.arrays import Floats, Vectors
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.reductions import BRANCHES, LaneReduction, Results, Share, reduced_tree, runs_on_gpu
+from sim.core.scheduling import is_short
+
+ITERATIONS_AT_ONCE = 4
+"""Iterations between two looks at how far the last ones led."""
+
+MOST_ITERATIONS = 200
+"""More are only asked for by steps in which a wave crosses hundreds of triangles."""
+
+TOLERANCE = 0.03
+"""Of the displacement by triangles, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
+
+LEAST_ACCELERATION = 0.1
+"""By triangles, that counts as one even where there is less [m/s²]: `TOLERANCE` is of a hundredth of the weight then."""
+
+ROOT_HALF = 0.5**0.5
+
+TINY_ENERGY = 1.0e-37
+"""Least divisor of energies [kg m²]: without any, there is nothing to solve."""
+
+HELD = 1.0e30
+"""Mass of held nodes in the sums over pieces [kg]."""
+
+
+ITS=[]
+
+
+class TriangleSolver:
+    """(M + dt² K) e = -dt² f for the displacements e by the triangles of all meshes, f and K at the prediction.
+
+    Forces push along the directions of the start, as threads do (`threads`), so that K consists of the stiffnesses
+    along these, and of a part of the tension that turns with them, Newmark's beta. Conjugate gradients with the 3 x 3
+    blocks of the nodes (Baraff & Witkin 1998, "Large steps in cloth simulation", without its filter, as held nodes have
+    no inverse mass), with one reduction an iteration (Chronopoulos & Gear 1989). They start from the multiple of the
+    displacement of the step before that leaves the least energy: what rests stays at rest, however few they are. Their
+    number falls with dt: a wave crosses dt (E/rho)^(1/2) in a step, 14 edges of 1 cm of cotton.
+
+    What iterations leave of linear momentum is taken from each piece of a mesh that no pin holds.
+
+    Args:
+        state: what they move.
+        cells: the triangles.
+    """
+
+    def __init__(self, state: ClothState, cells: DeviceCells) -> None:
+        self._state, self._cells = state, cells
+        count, n = cells.count, state.vertex_count
+        pieces, own, piece = _pieces(cells.host.nodes, n)
+        place = np.full(n, -1)
+        place[own] = np.arange(len(own))
+        corner = np.argsort(place[cells.host.nodes.ravel()], kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(place[cells.host.nodes.ravel()], minlength=len(own)))])
+        chunk = max(1, round(len(own) ** 0.5))
+        ends = np.concatenate([[0], np.cumsum(np.bincount(piece, minlength=pieces))])
+        chunks = [np.arange(a, b, chunk) for a, b in pairwise(ends)]
+        first = np.append(np.concatenate(chunks), len(own))
+        first_chunk = np.concatenate([[0], np.cumsum([len(each) for each in chunks])])
+        self._chunks, self._pieces, self._own = len(first) - 1, pieces, len(own)
+        self._nodes = MeshNodes(*map(_integers, (own, start, corner, piece, first, first_chunk)))
+
+        def vectors(size: int) -> ti.Ndarray:
+            return ti.Vector.ndarray(3, ti.f32, size)
+
+        self._frames = TriangleFrames(*(vectors(count) for _ in range(4)), ti.Vector.ndarray(4, ti.f32, count))
+        self._work = TriangleWork(
+            *(vectors(count) for _ in range(2)),
+            *(vectors(n) for _ in range(8)),
+            ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 3),
+            ti.Vector.ndarray(4, ti.f32, self._chunks),
+            vectors(pieces),
+        )
+        for array in self._work:
+            array.fill(0.0)
+        self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
+        self._short = is_short(count, TRIANGLE_NS) and is_short(len(own), NODE_OF_MESH_NS)
+        self._left = self._mass = 0.0
+
+    def take_parameters(self) -> None:
+        """Mass as it is now; cells hold their stiffness."""
+        self._mass = float(self._state.mass.to_numpy()[self._nodes.node.to_numpy()].sum())
+
+    def displace(self, dt: float, *, is_first: bool) -> None:
+        """Bring the displacements of a step of dt [s] to where the triangles let them go.
+
+        Once more in a step: from where the nodes are now, with what triangles pushed them by so far as an impulse.
+        """
+        cells, nodes, state, work, frames = self._cells.on_device, self._nodes, self._state, self._work, self._frames
+        count, own, share = self._cells.count, self._own, self._sums.over(self._own)
+        linearize(cells, count, state.nodes, state.carry, frames, work, dt * dt, self._short)
+        begin_iteration(
+            cells,
+            count,
+            nodes,
+            own,
+            state.nodes,
+            frames,
+            work,
+            state.elastic,
+            dt * dt,
+            int(is_first),
+            share,
+            self._short,
+        )
+        self._left, least = 1.0, self._mass * (LEAST_ACCELERATION * dt * dt) ** 2
+        for done in range(0, MOST_ITERATIONS, ITERATIONS_AT_ONCE):
+            for k in range(done, done + ITERATIONS_AT_ONCE):
+                iterate(cells, count, nodes, own, state.nodes, frames, work, dt * dt, k, share, self._short)
+            last, whole = decrease(work.scalars, done, done + ITERATIONS_AT_ONCE)
+            if not last > TOLERANCE**2 * (whole + least):
+                self._left = 0.0
+                break
+        import os
+        if os.environ.get('ITS'): ITS.append(done + ITERATIONS_AT_ONCE)
+        finish_iteration(
+            cells,
+            count,
+            nodes,
+            own,
+            self._chunks,
+            self._pieces,
+            state.nodes,
+            work,
+            state.elastic,
+            self._cells.multiplier,
+            self._short,
+        )
+
+    def excess(self) -> tuple[float, int]:
+        """Largest excess of a triangle along warp or weft [-], 1 if `MOST_ITERATIONS` were too few; and how many are
+        beyond `LARGEST_RESIDUAL`.
+        """
+        share = self._of_excess.over(self._cells.count)
+        found = measure_cell_excess(
+            self._cells.on_device, self._cells.count, self._cells.multiplier, self._state.nodes, share
+        )
+        return max(float(found[0]), self._left), int(found[1])
+
+
+def _pieces(triangles: NDArray[np.int32], count: int) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
+    """Number of connected pieces; nodes of triangles, piece by piece; the piece of each."""
+    a, b, c = triangles.T
+    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
+    label = connected_components(links, directed=False)[1]
+    used = np.unique(triangles)
+    own = used[np.argsort(label[used], kind="stable")]
+    pieces, piece = np.unique(label[own], return_inverse=True)
+    return len(pieces), own.astype(np.int64), piece.astype(np.int64)
+
+
+def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
+    array = ti.ndarray(ti.i32, len(values))
+    array.from_numpy(np.ascontiguousarray(values, dtype=np.int32))
+    return array
+
+
+@func
+def stresses(s: ti.i32, cells: CellArrays, frames: TriangleFrames, d_u: ti.math.vec3, d_v: ti.math.vec3):
+    """K's two forces, along the warp and the weft of a triangle [J], for changes of d_u and d_v."""
+    n_u, n_v, by_u, by_v, law = frames.n_u[s], frames.n_v[s], frames.by_u[s], frames.by_v[s], cells.law[s]
+    turning = frames.turning[s]
+    e_u, e_v = n_u.dot(d_u), n_v.dot(d_v)
+    shear = law[1] * (by_u.dot(d_u) + by_v.dot(d_v))
+    s_u = law[0] * (e_u + law[2] * e_v) * n_u + shear * by_u + turning[0] * (d_u - e_u * n_u)
+    s_v = law[0] * (e_v + law[2] * e_u) * n_v + shear * by_v + turning[1] * (d_v - e_v * n_v)
+    more, less = ROOT_HALF * (by_u + by_v), ROOT_HALF * (by_v - by_u)
+    d_more, d_less = d_u + d_v, d_u - d_v
+    s_more = turning[2] * (d_more - more.dot(d_more) * more)
+    s_less = turning[3] * (d_less - less.dot(d_less) * less)
+    return s_u + (s_more + s_less), s_v + (s_more - s_less)
+
+
+@func
+def change_of(coefficients: Floats, cells: CellArrays, vectors: Vectors, s: ti.i32) -> ti.math.vec3:
+    """sum_a c_a of vectors at the corners."""
+    total = ti.math.vec3(0.0)
+    for a in ti.static(range(TRIANGLE)):
+        total += coefficients[TRIANGLE * s + a] * vectors[cells.nodes[TRIANGLE * s + a]]
+    return total
+
+
+@func
+def gathered(k: ti.i32, nodes: MeshNodes, cells: CellArrays, work: TriangleWork) -> ti.math.vec3:
+    """Sum over the corners at a node of what the triangles' two forces are there [N]."""
+    total = ti.math.vec3(0.0)
+    for at in range(nodes.start[k], nodes.start[k + 1]):
+        corner = nodes.corner[at]
+        s = corner // TRIANGLE
+        total += cells.along[corner] * work.s_u[s] + cells.across[corner] * work.s_v[s]
+    return total
+
+
+@func
+def block(k: ti.i32, nodes: MeshNodes, cells: CellArrays, frames: TriangleFrames):
+    """The 3 x 3 block of K at a node [N/m]."""
+    total = ti.Matrix.zero(ti.f32, 3, 3)
+    one = ti.Matrix.identity(ti.f32, 3)
+    for at in range(nodes.start[k], nodes.start[k + 1]):
+        corner = nodes.corner[at]
+        s = corner // TRIANGLE
+        u, v, law, turning = cells.along[corner], cells.across[corner], cells.law[s], frames.turning[s]
+        n_u, n_v = u * frames.n_u[s], v * frames.n_v[s]
+        by = u * frames.by_u[s] + v * frames.by_v[s]
+        more = ROOT_HALF * (u + v) * (frames.by_u[s] + frames.by_v[s])
+        less = ROOT_HALF * (u - v) * (frames.by_v[s] - frames.by_u[s])
+        total += (law[0] - turning[0]) * n_u.outer_product(n_u) + (law[0] - turning[1]) * n_v.outer_product(n_v)
+        total += law[0] * law[2] * (n_u.outer_product(n_v) + n_v.outer_product(n_u)) + law[1] * by.outer_product(by)
+        total -= turning[2] * more.outer_product(more) + turning[3] * less.outer_product(less)
+        round_about = turning[0] * u * u + turning[1] * v * v
+        total += (round_about + turning[2] * (u + v) * (u + v) + turning[3] * (u - v) * (u - v)) * one
+    return total
+
+
+@func
+def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.vec3:
+    """The inverse block of a node times r."""
+    d, o = work.diagonal[i], work.off_diagonal[i]
+    return ti.math.vec3(
+        d.x * r.x + o.z * r.y + o.y * r.z, o.z * r.x + d.y * r.y + o.x * r.z, o.y * r.x + o.x * r.y + d.z * r.z
+    )
+
+
+@kernel
+def linearize(
+    cells: CellArrays,
+    count: ti.i32,
+    nodes: Nodes,
+    carry: Vectors,
+    frames: TriangleFrames,
+    work: TriangleWork,
+    dt_squared: ti.f32,
+    is_short: ti.template(),
+):
+    """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²]."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        start_u = derivative(cells.along, cells, nodes, carry, s, TRIANGLE)
+        start_v = derivative(cells.across, cells, nodes, carry, s, TRIANGLE)
+        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
+        law = cells.law[s]
+        length_u, length_v = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
+        shear, _, _ = shear_of(d_u, d_v)
+        n_u, n_v = direction_of(start_u, d_u / length_u), direction_of(start_v, d_v / length_v)
+        d_more, d_less, start_more, start_less = d_u + d_v, d_u - d_v, start_u + start_v, start_u - start_v
+        more = direction_of(start_more, d_more / ti.max(d_more.norm(), TINY_LENGTH))
+        less = direction_of(start_less, d_less / ti.max(d_less.norm(), TINY_LENGTH))
+        by_u, by_v = ROOT_HALF * (more - less), ROOT_HALF * (more + less)
+        e_u, e_v = length_u - 1.0, length_v - 1.0
+        work.s_u[s] = dt_squared * (law[0] * (e_u + law[2] * e_v) * n_u + law[1] * shear * by_u)
+        work.s_v[s] = dt_squared * (law[0] * (e_v + law[2] * e_u) * n_v + law[1] * shear * by_v)
+        frames.n_u[s], frames.n_v[s], frames.by_u[s], frames.by_v[s] = n_u, n_v, by_u, by_v
+        length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
+        e_u, e_v = length_u - 1.0, length_v - 1.0
+        pull = ROOT_HALF * law[1] * shear_of(start_u, start_v)[0]
+        tension = ti.math.vec4(law[0] * (e_u + law[2] * e_v), law[0] * (e_v + law[2] * e_u), pull, -pull)
+        lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
+        frames.turning[s] = STRAIGHTENED * ti.max(tension, 0.0) / ti.max(lengths, TINY_LENGTH)
+
+
+@kernel
+def begin_iteration(
+    cells: CellArrays,
+    count: ti.i32,
+    mesh: MeshNodes,
+    own: ti.i32,
+    nodes: Nodes,
+    frames: TriangleFrames,
+    work: TriangleWork,
+    elastic: Vectors,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    share: Share,
+    is_short: ti.template(),
+):
+    """Residual at the start, and inverse blocks; in the first solve of a step the start is a multiple of `elastic`, and
+    that is 0 from there on.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        i = mesh.node[k]
+        w_i = nodes.inverse_mass[i]
+        e_i, r_i = ti.math.vec3(0.0), ti.math.vec3(0.0)
+        if w_i > 0.0:
+            e_i = elastic[i]
+            r_i = -gathered(k, mesh, cells, work)
+            if is_first == 0:
+                r_i -= e_i / w_i
+            inverse = (1.0 / w_i * ti.Matrix.identity(ti.f32, 3) + dt_squared * block(k, mesh, cells, frames)).inverse()
+            work.diagonal[i] = ti.math.vec3(inverse[0, 0], inverse[1, 1], inverse[2, 2])
+            work.off_diagonal[i] = ti.math.vec3(inverse[1, 2], inverse[0, 2], inverse[0, 1])
+        work.r[i] = r_i
+        work.z[i] = ti.select(is_first, e_i, 0.0)
+        elastic[i] = ti.select(is_first, 0.0, e_i)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        d_u, d_v = change_of(cells.along, cells, work.z, s), change_of(cells.across, cells, work.z, s)
+        work.s_u[s], work.s_v[s] = stresses(s, cells, frames, d_u, d_v)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        i = mesh.node[k]
+        w_i = nodes.inverse_mass[i]
+        work.q[i] = ti.math.vec3(0.0)
+        if w_i > 0.0:
+            work.q[i] = work.z[i] / w_i + dt_squared * gathered(k, mesh, cells, work)
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        work_done, energy = 0.0, 0.0
+        for k in range(share.items):
+            n = lane * share.lane_step + k * share.item_step
+            if n < own:
+                i = mesh.node[n]
+                work_done += work.z[i].dot(work.r[i])
+                energy += work.z[i].dot(work.q[i])
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = work_done, energy
+    reduced_tree(share.tree)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        i = mesh.node[k]
+        work_done, energy = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
+        multiple = work_done / ti.max(energy, TINY_ENERGY)
+        if k == 0:
+            work.scalars[0] = multiple * work_done
+        work.x[i] = multiple * work.z[i]
+        r_i = work.r[i] - multiple * work.q[i]
+        work.r[i] = r_i
+        work.z[i] = preconditioned(i, work, r_i)
+        work.p[i], work.q[i] = ti.math.vec3(0.0), ti.math.vec3(0.0)
+
+
+@kernel
+def iterate(
+    cells: CellArrays,
+    count: ti.i32,
+    mesh: MeshNodes,
+    own: ti.i32,
+    nodes: Nodes,
+    frames: TriangleFrames,
+    work: TriangleWork,
+    dt_squared: ti.f32,
+    number: ti.i32,
+    share: Share,
+    is_short: ti.template(),
+):
+    """An iteration, 0 the first one: with z = B r, gamma = r.z, delta = z.A z,
+
+    beta = gamma/gamma', alpha = gamma/(delta - beta gamma/alpha'), p = z + beta p, q = A z + beta q,
+    x += alpha p, r -= alpha q.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        d_u, d_v = change_of(cells.along, cells, work.z, s), change_of(cells.across, cells, work.z, s)
+        work.s_u[s], work.s_v[s] = stresses(s, cells, frames, d_u, d_v)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        i = mesh.node[k]
+        w_i = nodes.inverse_mass[i]
+        if w_i > 0.0:
+            work.a_z[i] = work.z[i] / w_i + dt_squared * gathered(k, mesh, cells, work)
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        gamma, delta = 0.0, 0.0
+        for k in range(share.items):
+            n = lane * share.lane_step + k * share.item_step
+            if n < own:
+                i = mesh.node[n]
+                gamma += work.z[i].dot(work.r[i])
+                delta += work.z[i].dot(work.a_z[i])
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = gamma, delta
+    reduced_tree(share.tree)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        i = mesh.node[k]
+        gamma, delta = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
+        beta, before = 0.0, 1.0
+        if number > 0:
+            beta = gamma / ti.max(work.scalars[2 * number - 1], TINY_ENERGY)
+            before = work.scalars[2 * number]
+        alpha = 0.0
+        if before > 0.0:
+            rest = delta - beta * gamma / before
+            alpha = ti.select(rest > 0.0, gamma / rest, 0.0)
+        if k == 0:
+            work.scalars[2 * number + 1], work.scalars[2 * number + 2] = gamma, alpha
+        p_i = work.z[i] + beta * work.p[i]
+        q_i = work.a_z[i] + beta * work.q[i]
+        work.p[i], work.q[i] = p_i, q_i
+        work.x[i] = work.x[i] + alpha * p_i
+        r_i = work.r[i] - alpha * q_i
+        work.r[i] = r_i
+        work.z[i] = preconditioned(i, work, r_i)
+
+
+@kernel
+def decrease(scalars: Floats, first: ti.i32, end: ti.i32) -> ti.math.vec2:
+    """By how much iterations from `first` to before `end` let the energy fall, and by how much all up to there."""
+    last, whole = 0.0, scalars[0]
+    ti.loop_config(serialize=True)
+    for k in range(end):
+        change = scalars[2 * k + 1] * scalars[2 * k + 2]
+        whole += change
+        if k >= first:
+            last += change
+    return ti.math.vec2(last, whole)
+
+
+@kernel
+def finish_iteration(
+    cells: CellArrays,
+    count: ti.i32,
+    mesh: MeshNodes,
+    own: ti.i32,
+    chunks: ti.i32,
+    pieces: ti.i32,
+    nodes: Nodes,
+    work: TriangleWork,
+    elastic: Vectors,
+    expected: Floats,
+    is_short: ti.template(),
+):
+    """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
+    triangles are expected to have then.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for chunk in range(chunks):
+        moment, mass = ti.math.vec3(0.0), 0.0
+        for k in range(mesh.chunk[chunk], mesh.chunk[chunk + 1]):
+            i = mesh.node[k]
+            w_i = nodes.inverse_mass[i]
+            m_i = HELD
+            if w_i > 0.0:
+                m_i = 1.0 / w_i
+            moment += m_i * work.x[i]
+            mass += m_i
+        work.moment[chunk] = ti.math.vec4(moment, mass)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for piece in range(pieces):
+        total = ti.math.vec4(0.0)
+        for chunk in range(mesh.first_chunk[piece], mesh.first_chunk[piece + 1]):
+            total += work.moment[chunk]
+        work.shift[piece] = ti.select(total[3] < HELD, total.xyz / total[3], 0.0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        i = mesh.node[k]
+        if nodes.inverse_mass[i] > 0.0:
+            x_i = work.x[i] - work.shift[mesh.piece[k]]
+            elastic[i] = elastic[i] + x_i
+            nodes.displacement[i] = nodes.displacement[i] + x_i
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
+        expected[STRAINS * s], expected[STRAINS * s + 1] = d_u.norm(), d_v.norm()
+
+
+@kernel
+def measure_cell_excess(
+    cells: CellArrays, count: ti.i32, expected: Floats, nodes: Nodes, share: Share
+) -> Results:
+    """Largest excess of triangles along warp and weft, as `spring_convergence` has it, and how many of both are beyond
+    `LARGEST_RESIDUAL`.
+    """
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        largest, unconverged = 0.0, 0.0
+        for k in range(share.items):
+            s = lane * share.lane_step + k * share.item_step
+            if s < count:
+                d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
+                d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
+                more, nu = ti.math.vec2(d_u.norm(), d_v.norm()), cells.law[s][2]
+                more -= ti.math.vec2(expected[STRAINS * s], expected[STRAINS * s + 1])
+                for excess in ti.static((more.x + nu * more.y, more.y + nu * more.x)):
+                    largest = ti.max(largest, excess)
+                    if excess > LARGEST_RESIDUAL:
+                        unconverged += 1.0
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
+    return reduced_tree(share.tree)
