@@ -20,6 +20,7 @@ Pairs = ti.types.ndarray(dtype=Two, ndim=1)
 Triples = ti.types.ndarray(dtype=Three, ndim=1)
 Quadruples = ti.types.ndarray(dtype=Four, ndim=1)
 Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
+Strains = ti.types.ndarray(dtype=ti.math.vec2, ndim=1)
 Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 
 
@@ -76,11 +77,15 @@ class CellArrays(NamedTuple):
 
 @bundle
 class MeshNodes(NamedTuple):
-    """Nodes of triangles, o of them, piece by piece; chunks of about as many nodes as there are chunks."""
+    """Nodes of s triangles, o of them, piece by piece, in chunks of about as many nodes as there are chunks."""
 
     node: Integers  # number, (o,)
     start: Integers  # of each node in `corner`, (o + 1,)
     corner: Integers  # corner a of triangle s is 3 s + a
+    share: Floats  # of each corner's triangle in the strain of its node, (3 s,)
+    swapped: Integers  # as of `Cells`, (3 s,)
+    strain: Strains  # e_u and e_v of triangles, (s,)
+    mean: Strains  # of nodes, (n,)
     piece: Integers  # (o,)
     chunk: Integers  # first node of each chunk, and o
     first_chunk: Integers  # of each piece, and number of chunks
@@ -103,6 +108,8 @@ class TriangleWork(NamedTuple):
 
     s_u: Vectors  # forces along d_u and d_v [J], (s,)
     s_v: Vectors
+    start: Strains  # e_u and e_v at the start of the step, (s,)
+    start_mean: Strains  # (n,)
     x: Vectors  # solution [m], (n,)
     r: Vectors  # residual [kg m]
     z: Vectors  # preconditioned residual [m]

@@ -1,16 +1,10 @@
 """Triangles of meshes, solved together in every step: one Newton step of implicit Euler by conjugate gradients."""
 
-from itertools import pairwise
-
-import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, TriangleFrames, TriangleWork
-from sim.cloth.cells import STRAINS, TRIANGLE
-from sim.cloth.device_cells import DeviceCells, derivative, shear_of
+from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, Strains, TriangleFrames, TriangleWork
+from sim.cloth.cells import OWN_SHARE, TRIANGLE
+from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
 from sim.cloth.device_springs import TINY_LENGTH
 from sim.cloth.loop_costs import NODE_OF_MESH_NS, TRIANGLE_NS
 from sim.cloth.spring_convergence import LARGEST_RESIDUAL
@@ -36,6 +30,9 @@ LEAST_ACCELERATION = 0.1
 
 ROOT_HALF = 0.5**0.5
 
+BLOCK_SHARE = OWN_SHARE + (1.0 - OWN_SHARE) / 6.0
+"""What blocks of nodes have of the stiffness of triangles, on equal triangles."""
+
 TINY_ENERGY = 1.0e-37
 """Least divisor of energies [kg m²]: without any, there is nothing to solve."""
 
@@ -43,7 +40,7 @@ HELD = 1.0e30
 """Mass of held nodes in the sums over pieces [kg]."""
 
 
-ITS=[]
+ITS = []
 
 
 class TriangleSolver:
@@ -66,18 +63,7 @@ class TriangleSolver:
     def __init__(self, state: ClothState, cells: DeviceCells) -> None:
         self._state, self._cells = state, cells
         count, n = cells.count, state.vertex_count
-        pieces, own, piece = _pieces(cells.host.nodes, n)
-        place = np.full(n, -1)
-        place[own] = np.arange(len(own))
-        corner = np.argsort(place[cells.host.nodes.ravel()], kind="stable")
-        start = np.concatenate([[0], np.cumsum(np.bincount(place[cells.host.nodes.ravel()], minlength=len(own)))])
-        chunk = max(1, round(len(own) ** 0.5))
-        ends = np.concatenate([[0], np.cumsum(np.bincount(piece, minlength=pieces))])
-        chunks = [np.arange(a, b, chunk) for a, b in pairwise(ends)]
-        first = np.append(np.concatenate(chunks), len(own))
-        first_chunk = np.concatenate([[0], np.cumsum([len(each) for each in chunks])])
-        self._chunks, self._pieces, self._own = len(first) - 1, pieces, len(own)
-        self._nodes = MeshNodes(*map(_integers, (own, start, corner, piece, first, first_chunk)))
+        self._nodes, self._own, self._chunks, self._pieces = cells.mesh, cells.own, cells.chunks, cells.pieces
 
         def vectors(size: int) -> ti.Ndarray:
             return ti.Vector.ndarray(3, ti.f32, size)
@@ -85,15 +71,18 @@ class TriangleSolver:
         self._frames = TriangleFrames(*(vectors(count) for _ in range(4)), ti.Vector.ndarray(4, ti.f32, count))
         self._work = TriangleWork(
             *(vectors(count) for _ in range(2)),
+            *(ti.Vector.ndarray(2, ti.f32, size) for size in (count, n)),
             *(vectors(n) for _ in range(8)),
             ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 3),
             ti.Vector.ndarray(4, ti.f32, self._chunks),
-            vectors(pieces),
+            vectors(cells.pieces),
         )
         for array in self._work:
             array.fill(0.0)
+        self._expected = ti.Vector.ndarray(2, ti.f32, n)
+        self._expected.fill(0.0)
         self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
-        self._short = is_short(count, TRIANGLE_NS) and is_short(len(own), NODE_OF_MESH_NS)
+        self._short = is_short(count, TRIANGLE_NS) and is_short(cells.own, NODE_OF_MESH_NS)
         self._left = self._mass = 0.0
 
     def take_parameters(self) -> None:
@@ -107,7 +96,7 @@ class TriangleSolver:
         """
         cells, nodes, state, work, frames = self._cells.on_device, self._nodes, self._state, self._work, self._frames
         count, own, share = self._cells.count, self._own, self._sums.over(self._own)
-        linearize(cells, count, state.nodes, state.carry, frames, work, dt * dt, self._short)
+        linearize(cells, count, nodes, own, state.nodes, state.carry, frames, work, dt, self._short)
         begin_iteration(
             cells,
             count,
@@ -117,7 +106,8 @@ class TriangleSolver:
             frames,
             work,
             state.elastic,
-            dt * dt,
+            dt,
+            1.0 / dt,
             int(is_first),
             share,
             self._short,
@@ -125,13 +115,15 @@ class TriangleSolver:
         self._left, least = 1.0, self._mass * (LEAST_ACCELERATION * dt * dt) ** 2
         for done in range(0, MOST_ITERATIONS, ITERATIONS_AT_ONCE):
             for k in range(done, done + ITERATIONS_AT_ONCE):
-                iterate(cells, count, nodes, own, state.nodes, frames, work, dt * dt, k, share, self._short)
+                iterate(cells, count, nodes, own, state.nodes, frames, work, dt, 1.0 / dt, k, share, self._short)
             last, whole = decrease(work.scalars, done, done + ITERATIONS_AT_ONCE)
             if not last > TOLERANCE**2 * (whole + least):
                 self._left = 0.0
                 break
         import os
-        if os.environ.get('ITS'): ITS.append(done + ITERATIONS_AT_ONCE)
+
+        if os.environ.get("ITS"):
+            ITS.append(done + ITERATIONS_AT_ONCE)
         finish_iteration(
             cells,
             count,
@@ -142,52 +134,52 @@ class TriangleSolver:
             state.nodes,
             work,
             state.elastic,
-            self._cells.multiplier,
+            self._expected,
             self._short,
         )
 
     def excess(self) -> tuple[float, int]:
-        """Largest excess of a triangle along warp or weft [-], 1 if `MOST_ITERATIONS` were too few; and how many are
-        beyond `LARGEST_RESIDUAL`.
+        """Largest excess of strain at a node [-], 1 if `MOST_ITERATIONS` were too few; and how many are beyond
+        `LARGEST_RESIDUAL`.
         """
-        share = self._of_excess.over(self._cells.count)
-        found = measure_cell_excess(
-            self._cells.on_device, self._cells.count, self._cells.multiplier, self._state.nodes, share
+        share = self._of_excess.over(self._own)
+        cells, mesh, count = self._cells.on_device, self._nodes, self._cells.count
+        found = measure_node_excess(
+            cells, count, mesh, self._own, self._state.nodes, self._expected, share, self._short
         )
         return max(float(found[0]), self._left), int(found[1])
 
 
-def _pieces(triangles: NDArray[np.int32], count: int) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
-    """Number of connected pieces; nodes of triangles, piece by piece; the piece of each."""
-    a, b, c = triangles.T
-    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
-    label = connected_components(links, directed=False)[1]
-    used = np.unique(triangles)
-    own = used[np.argsort(label[used], kind="stable")]
-    pieces, piece = np.unique(label[own], return_inverse=True)
-    return len(pieces), own.astype(np.int64), piece.astype(np.int64)
-
-
-def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
-    array = ti.ndarray(ti.i32, len(values))
-    array.from_numpy(np.ascontiguousarray(values, dtype=np.int32))
-    return array
+@func
+def stiffer(s: ti.i32, cells: CellArrays, rate: ti.f32) -> ti.f32:
+    """By what damping multiplies the stiffness of a step of 1/`rate`."""
+    return 1.0 + cells.law[s][3] * rate
 
 
 @func
-def stresses(s: ti.i32, cells: CellArrays, frames: TriangleFrames, d_u: ti.math.vec3, d_v: ti.math.vec3):
-    """K's two forces, along the warp and the weft of a triangle [J], for changes of d_u and d_v."""
-    n_u, n_v, by_u, by_v, law = frames.n_u[s], frames.n_v[s], frames.by_u[s], frames.by_v[s], cells.law[s]
-    turning = frames.turning[s]
+def strain(
+    s: ti.i32, cells: CellArrays, frames: TriangleFrames, work: TriangleWork, moved: Vectors, rate: ti.f32
+) -> ti.math.vec2:
+    """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `work`."""
+    d_u, d_v = change_of(cells.along, cells, moved, s), change_of(cells.across, cells, moved, s)
+    n_u, n_v, by_u, by_v, turning = frames.n_u[s], frames.n_v[s], frames.by_u[s], frames.by_v[s], frames.turning[s]
     e_u, e_v = n_u.dot(d_u), n_v.dot(d_v)
-    shear = law[1] * (by_u.dot(d_u) + by_v.dot(d_v))
-    s_u = law[0] * (e_u + law[2] * e_v) * n_u + shear * by_u + turning[0] * (d_u - e_u * n_u)
-    s_v = law[0] * (e_v + law[2] * e_u) * n_v + shear * by_v + turning[1] * (d_v - e_v * n_v)
+    shear = stiffer(s, cells, rate) * cells.law[s][1] * (by_u.dot(d_u) + by_v.dot(d_v))
     more, less = ROOT_HALF * (by_u + by_v), ROOT_HALF * (by_v - by_u)
     d_more, d_less = d_u + d_v, d_u - d_v
     s_more = turning[2] * (d_more - more.dot(d_more) * more)
     s_less = turning[3] * (d_less - less.dot(d_less) * less)
-    return s_u + (s_more + s_less), s_v + (s_more - s_less)
+    work.s_u[s] = shear * by_u + turning[0] * (d_u - e_u * n_u) + (s_more + s_less)
+    work.s_v[s] = shear * by_v + turning[1] * (d_v - e_v * n_v) + (s_more - s_less)
+    return ti.math.vec2(e_u, e_v)
+
+
+@func
+def stretch(s: ti.i32, cells: CellArrays, mesh: MeshNodes, frames: TriangleFrames, work: TriangleWork, rate: ti.f32):
+    """Add the forces by e_u and e_v to those in `work`."""
+    tension = stiffer(s, cells, rate) * tension_of(s, cells, mesh, mesh.strain, mesh.mean)
+    work.s_u[s] = work.s_u[s] + tension[0] * frames.n_u[s]
+    work.s_v[s] = work.s_v[s] + tension[1] * frames.n_v[s]
 
 
 @func
@@ -211,20 +203,23 @@ def gathered(k: ti.i32, nodes: MeshNodes, cells: CellArrays, work: TriangleWork)
 
 
 @func
-def block(k: ti.i32, nodes: MeshNodes, cells: CellArrays, frames: TriangleFrames):
-    """The 3 x 3 block of K at a node [N/m]."""
+def block(k: ti.i32, nodes: MeshNodes, cells: CellArrays, frames: TriangleFrames, rate: ti.f32):
+    """About the 3 x 3 block of K at a node [N/m]: means have a sixth of the stiffness on equal triangles."""
     total = ti.Matrix.zero(ti.f32, 3, 3)
     one = ti.Matrix.identity(ti.f32, 3)
     for at in range(nodes.start[k], nodes.start[k + 1]):
         corner = nodes.corner[at]
         s = corner // TRIANGLE
-        u, v, law, turning = cells.along[corner], cells.across[corner], cells.law[s], frames.turning[s]
+        u, v, turning = cells.along[corner], cells.across[corner], frames.turning[s]
+        law = stiffer(s, cells, rate) * ti.math.vec2(BLOCK_SHARE * cells.law[s][0], cells.law[s][1])
         n_u, n_v = u * frames.n_u[s], v * frames.n_v[s]
         by = u * frames.by_u[s] + v * frames.by_v[s]
         more = ROOT_HALF * (u + v) * (frames.by_u[s] + frames.by_v[s])
         less = ROOT_HALF * (u - v) * (frames.by_v[s] - frames.by_u[s])
         total += (law[0] - turning[0]) * n_u.outer_product(n_u) + (law[0] - turning[1]) * n_v.outer_product(n_v)
-        total += law[0] * law[2] * (n_u.outer_product(n_v) + n_v.outer_product(n_u)) + law[1] * by.outer_product(by)
+        total += law[0] * cells.law[s][2] * (n_u.outer_product(n_v) + n_v.outer_product(n_u)) + law[
+            1
+        ] * by.outer_product(by)
         total -= turning[2] * more.outer_product(more) + turning[3] * less.outer_product(less)
         round_about = turning[0] * u * u + turning[1] * v * v
         total += (round_about + turning[2] * (u + v) * (u + v) + turning[3] * (u - v) * (u - v)) * one
@@ -244,14 +239,19 @@ def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.ve
 def linearize(
     cells: CellArrays,
     count: ti.i32,
+    mesh: MeshNodes,
+    own: ti.i32,
     nodes: Nodes,
     carry: Vectors,
     frames: TriangleFrames,
     work: TriangleWork,
-    dt_squared: ti.f32,
+    dt: ti.f32,
     is_short: ti.template(),
 ):
-    """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²]."""
+    """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
+
+    Damping adds tau times the rate at which the prediction strains.
+    """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(count):
@@ -259,24 +259,36 @@ def linearize(
         start_v = derivative(cells.across, cells, nodes, carry, s, TRIANGLE)
         d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
         d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
-        law = cells.law[s]
+        rate = cells.law[s][3] / dt
         length_u, length_v = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
-        shear, _, _ = shear_of(d_u, d_v)
         n_u, n_v = direction_of(start_u, d_u / length_u), direction_of(start_v, d_v / length_v)
         d_more, d_less, start_more, start_less = d_u + d_v, d_u - d_v, start_u + start_v, start_u - start_v
         more = direction_of(start_more, d_more / ti.max(d_more.norm(), TINY_LENGTH))
         less = direction_of(start_less, d_less / ti.max(d_less.norm(), TINY_LENGTH))
         by_u, by_v = ROOT_HALF * (more - less), ROOT_HALF * (more + less)
-        e_u, e_v = length_u - 1.0, length_v - 1.0
-        work.s_u[s] = dt_squared * (law[0] * (e_u + law[2] * e_v) * n_u + law[1] * shear * by_u)
-        work.s_v[s] = dt_squared * (law[0] * (e_v + law[2] * e_u) * n_v + law[1] * shear * by_v)
         frames.n_u[s], frames.n_v[s], frames.by_u[s], frames.by_v[s] = n_u, n_v, by_u, by_v
+        moved_u, moved_v = d_u - start_u, d_v - start_v
+        e = ti.math.vec2(length_u - 1.0, length_v - 1.0)
+        mesh.strain[s] = e + rate * ti.math.vec2(n_u.dot(moved_u), n_v.dot(moved_v))
+        shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v))
+        work.s_u[s], work.s_v[s] = cells.law[s][1] * shear * by_u, cells.law[s][1] * shear * by_v
         length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
-        e_u, e_v = length_u - 1.0, length_v - 1.0
-        pull = ROOT_HALF * law[1] * shear_of(start_u, start_v)[0]
-        tension = ti.math.vec4(law[0] * (e_u + law[2] * e_v), law[0] * (e_v + law[2] * e_u), pull, -pull)
+        work.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
         lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
-        frames.turning[s] = STRAIGHTENED * ti.max(tension, 0.0) / ti.max(lengths, TINY_LENGTH)
+        pull = ROOT_HALF * cells.law[s][1] * shear_of(start_u, start_v)[0]
+        frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+        work.start_mean[mesh.node[k]] = mean_strain(k, mesh, work.start)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        tension = tension_of(s, cells, mesh, work.start, work.start_mean)
+        frames.turning[s] = ti.max(frames.turning[s] * ti.math.vec4(tension, 1.0, 1.0), 0.0)
+        stretch(s, cells, mesh, frames, work, 0.0)
+        work.s_u[s], work.s_v[s] = dt * dt * work.s_u[s], dt * dt * work.s_v[s]
 
 
 @kernel
@@ -289,7 +301,8 @@ def begin_iteration(
     frames: TriangleFrames,
     work: TriangleWork,
     elastic: Vectors,
-    dt_squared: ti.f32,
+    dt: ti.f32,
+    rate: ti.f32,
     is_first: ti.i32,
     share: Share,
     is_short: ti.template(),
@@ -308,7 +321,9 @@ def begin_iteration(
             r_i = -gathered(k, mesh, cells, work)
             if is_first == 0:
                 r_i -= e_i / w_i
-            inverse = (1.0 / w_i * ti.Matrix.identity(ti.f32, 3) + dt_squared * block(k, mesh, cells, frames)).inverse()
+            inverse = (
+                1.0 / w_i * ti.Matrix.identity(ti.f32, 3) + dt * dt * block(k, mesh, cells, frames, rate)
+            ).inverse()
             work.diagonal[i] = ti.math.vec3(inverse[0, 0], inverse[1, 1], inverse[2, 2])
             work.off_diagonal[i] = ti.math.vec3(inverse[1, 2], inverse[0, 2], inverse[0, 1])
         work.r[i] = r_i
@@ -317,8 +332,15 @@ def begin_iteration(
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(count):
-        d_u, d_v = change_of(cells.along, cells, work.z, s), change_of(cells.across, cells, work.z, s)
-        work.s_u[s], work.s_v[s] = stresses(s, cells, frames, d_u, d_v)
+        mesh.strain[s] = strain(s, cells, frames, work, work.z, rate)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        stretch(s, cells, mesh, frames, work, rate)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(own):
@@ -326,7 +348,7 @@ def begin_iteration(
         w_i = nodes.inverse_mass[i]
         work.q[i] = ti.math.vec3(0.0)
         if w_i > 0.0:
-            work.q[i] = work.z[i] / w_i + dt_squared * gathered(k, mesh, cells, work)
+            work.q[i] = work.z[i] / w_i + dt * dt * gathered(k, mesh, cells, work)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(share.tree.lanes):
@@ -363,7 +385,8 @@ def iterate(
     nodes: Nodes,
     frames: TriangleFrames,
     work: TriangleWork,
-    dt_squared: ti.f32,
+    dt: ti.f32,
+    rate: ti.f32,
     number: ti.i32,
     share: Share,
     is_short: ti.template(),
@@ -376,15 +399,22 @@ def iterate(
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(count):
-        d_u, d_v = change_of(cells.along, cells, work.z, s), change_of(cells.across, cells, work.z, s)
-        work.s_u[s], work.s_v[s] = stresses(s, cells, frames, d_u, d_v)
+        mesh.strain[s] = strain(s, cells, frames, work, work.z, rate)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        stretch(s, cells, mesh, frames, work, rate)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(own):
         i = mesh.node[k]
         w_i = nodes.inverse_mass[i]
         if w_i > 0.0:
-            work.a_z[i] = work.z[i] / w_i + dt_squared * gathered(k, mesh, cells, work)
+            work.a_z[i] = work.z[i] / w_i + dt * dt * gathered(k, mesh, cells, work)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(share.tree.lanes):
@@ -434,6 +464,23 @@ def decrease(scalars: Floats, first: ti.i32, end: ti.i32) -> ti.math.vec2:
     return ti.math.vec2(last, whole)
 
 
+@func
+def measure_displaced(
+    cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, is_short: ti.template()
+):
+    """Strains of triangles, then of nodes, where displacements lead; for the outermost level of a kernel."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(count):
+        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
+        mesh.strain[s] = ti.math.vec2(d_u.norm() - 1.0, d_v.norm() - 1.0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(own):
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+
+
 @kernel
 def finish_iteration(
     cells: CellArrays,
@@ -445,11 +492,11 @@ def finish_iteration(
     nodes: Nodes,
     work: TriangleWork,
     elastic: Vectors,
-    expected: Floats,
+    expected: Strains,
     is_short: ti.template(),
 ):
     """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
-    triangles are expected to have then.
+    nodes are expected to have then.
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -479,35 +526,39 @@ def finish_iteration(
             x_i = work.x[i] - work.shift[mesh.piece[k]]
             elastic[i] = elastic[i] + x_i
             nodes.displacement[i] = nodes.displacement[i] + x_i
+    measure_displaced(cells, count, mesh, own, nodes, is_short)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
-        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
-        expected[STRAINS * s], expected[STRAINS * s + 1] = d_u.norm(), d_v.norm()
+    for k in range(own):
+        expected[mesh.node[k]] = mesh.mean[mesh.node[k]]
 
 
 @kernel
-def measure_cell_excess(
-    cells: CellArrays, count: ti.i32, expected: Floats, nodes: Nodes, share: Share
+def measure_node_excess(
+    cells: CellArrays,
+    count: ti.i32,
+    mesh: MeshNodes,
+    own: ti.i32,
+    nodes: Nodes,
+    expected: Strains,
+    share: Share,
+    is_short: ti.template(),
 ) -> Results:
-    """Largest excess of triangles along warp and weft, as `spring_convergence` has it, and how many of both are beyond
-    `LARGEST_RESIDUAL`.
+    """Largest excess of strain of nodes of triangles, as `spring_convergence` has it, and how many along warp and weft
+    are beyond `LARGEST_RESIDUAL`.
     """
+    measure_displaced(cells, count, mesh, own, nodes, is_short)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(share.tree.lanes):
         largest, unconverged = 0.0, 0.0
         for k in range(share.items):
-            s = lane * share.lane_step + k * share.item_step
-            if s < count:
-                d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
-                d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
-                more, nu = ti.math.vec2(d_u.norm(), d_v.norm()), cells.law[s][2]
-                more -= ti.math.vec2(expected[STRAINS * s], expected[STRAINS * s + 1])
-                for excess in ti.static((more.x + nu * more.y, more.y + nu * more.x)):
-                    largest = ti.max(largest, excess)
-                    if excess > LARGEST_RESIDUAL:
+            n = lane * share.lane_step + k * share.item_step
+            if n < own:
+                excess = mesh.mean[mesh.node[n]] - expected[mesh.node[n]]
+                largest = ti.max(largest, excess.x, excess.y)
+                for axis in ti.static(range(2)):
+                    if excess[axis] > LARGEST_RESIDUAL:
                         unconverged += 1.0
         share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
     return reduced_tree(share.tree)

@@ -81,7 +81,7 @@ class XPBDSprings:
         return float("inf")
 
     def accelerate(self, dt: float) -> None:
-        """Damp the velocities along springs between two nodes.
+        """Damp the velocities along springs between two nodes, and in the shear of rectangles.
 
         Apart from their own sweep: there, a damping of gamma = tau / dt (Macklin et al. 2016, eq. 26) also brakes what
         the sweep has to undo of the prediction, and makes their largest stiffness 1 + gamma times smaller. Bend springs
@@ -103,7 +103,7 @@ class XPBDSprings:
                     springs.arity,
                 )
         for cells in self._cells:
-            if cells.is_damped:
+            if cells.arity != TRIANGLE and cells.is_damped:
                 for colour in cells.first_colours:
                     damp_cells(
                         cells.on_device, cells.cell_of_colour, colour, state.nodes, state.motion, dt, cells.arity
