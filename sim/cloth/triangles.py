@@ -114,8 +114,7 @@ class TriangleSolver:
         )
         self._left, least = 1.0, self._mass * (LEAST_ACCELERATION * dt * dt) ** 2
         for done in range(0, MOST_ITERATIONS, ITERATIONS_AT_ONCE):
-            for k in range(done, done + ITERATIONS_AT_ONCE):
-                iterate(cells, count, nodes, own, state.nodes, frames, work, dt, 1.0 / dt, k, share, self._short)
+            iterate(cells, count, nodes, own, state.nodes, frames, work, dt, 1.0 / dt, done, share, self._short)
             last, whole = decrease(work.scalars, done, done + ITERATIONS_AT_ONCE)
             if not last > TOLERANCE**2 * (whole + least):
                 self._left = 0.0
@@ -387,68 +386,69 @@ def iterate(
     work: TriangleWork,
     dt: ti.f32,
     rate: ti.f32,
-    number: ti.i32,
+    first: ti.i32,
     share: Share,
     is_short: ti.template(),
 ):
-    """An iteration, 0 the first one: with z = B r, gamma = r.z, delta = z.A z,
+    """`ITERATIONS_AT_ONCE` iterations, from number `first` on: with z = B r, gamma = r.z, delta = z.A z,
 
     beta = gamma/gamma', alpha = gamma/(delta - beta gamma/alpha'), p = z + beta p, q = A z + beta q,
     x += alpha p, r -= alpha q.
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for s in range(count):
-        mesh.strain[s] = strain(s, cells, frames, work, work.z, rate)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for k in range(own):
-        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for s in range(count):
-        stretch(s, cells, mesh, frames, work, rate)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for k in range(own):
-        i = mesh.node[k]
-        w_i = nodes.inverse_mass[i]
-        if w_i > 0.0:
-            work.a_z[i] = work.z[i] / w_i + dt * dt * gathered(k, mesh, cells, work)
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
-        gamma, delta = 0.0, 0.0
-        for k in range(share.items):
-            n = lane * share.lane_step + k * share.item_step
-            if n < own:
-                i = mesh.node[n]
-                gamma += work.z[i].dot(work.r[i])
-                delta += work.z[i].dot(work.a_z[i])
-        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = gamma, delta
-    reduced_tree(share.tree)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for k in range(own):
-        i = mesh.node[k]
-        gamma, delta = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
-        beta, before = 0.0, 1.0
-        if number > 0:
-            beta = gamma / ti.max(work.scalars[2 * number - 1], TINY_ENERGY)
-            before = work.scalars[2 * number]
-        alpha = 0.0
-        if before > 0.0:
-            rest = delta - beta * gamma / before
-            alpha = ti.select(rest > 0.0, gamma / rest, 0.0)
-        if k == 0:
-            work.scalars[2 * number + 1], work.scalars[2 * number + 2] = gamma, alpha
-        p_i = work.z[i] + beta * work.p[i]
-        q_i = work.a_z[i] + beta * work.q[i]
-        work.p[i], work.q[i] = p_i, q_i
-        work.x[i] = work.x[i] + alpha * p_i
-        r_i = work.r[i] - alpha * q_i
-        work.r[i] = r_i
-        work.z[i] = preconditioned(i, work, r_i)
+    for step in ti.static(range(ITERATIONS_AT_ONCE)):
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
+        for s in range(count):
+            mesh.strain[s] = strain(s, cells, frames, work, work.z, rate)
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
+        for k in range(own):
+            mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
+        for s in range(count):
+            stretch(s, cells, mesh, frames, work, rate)
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
+        for k in range(own):
+            i = mesh.node[k]
+            w_i = nodes.inverse_mass[i]
+            if w_i > 0.0:
+                work.a_z[i] = work.z[i] / w_i + dt * dt * gathered(k, mesh, cells, work)
+        if ti.static(not runs_on_gpu()):
+            ti.loop_config(serialize=True)
+        for lane in range(share.tree.lanes):
+            gamma, delta = 0.0, 0.0
+            for k in range(share.items):
+                n = lane * share.lane_step + k * share.item_step
+                if n < own:
+                    i = mesh.node[n]
+                    gamma += work.z[i].dot(work.r[i])
+                    delta += work.z[i].dot(work.a_z[i])
+            share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = gamma, delta
+        reduced_tree(share.tree)
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
+        for k in range(own):
+            i = mesh.node[k]
+            gamma, delta = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
+            beta, before = 0.0, 1.0
+            if first + step > 0:
+                beta = gamma / ti.max(work.scalars[2 * (first + step) - 1], TINY_ENERGY)
+                before = work.scalars[2 * (first + step)]
+            alpha = 0.0
+            if before > 0.0:
+                rest = delta - beta * gamma / before
+                alpha = ti.select(rest > 0.0, gamma / rest, 0.0)
+            if k == 0:
+                work.scalars[2 * (first + step) + 1], work.scalars[2 * (first + step) + 2] = gamma, alpha
+            p_i = work.z[i] + beta * work.p[i]
+            q_i = work.a_z[i] + beta * work.q[i]
+            work.p[i], work.q[i] = p_i, q_i
+            work.x[i] = work.x[i] + alpha * p_i
+            r_i = work.r[i] - alpha * q_i
+            work.r[i] = r_i
+            work.z[i] = preconditioned(i, work, r_i)
 
 
 @kernel
