@@ -25,7 +25,7 @@ MOST_ITERATIONS = 200
 TOLERANCE = 0.03
 """Of the displacement by triangles, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
 
-LEAST_ACCELERATION = 0.1
+LEAST_ACCELERATION = 1.0
 """By triangles, that counts as one even where there is less [m/s²]: `TOLERANCE` is of a hundredth of the weight then."""
 
 ROOT_HALF = 0.5**0.5
@@ -38,9 +38,6 @@ TINY_ENERGY = 1.0e-37
 
 HELD = 1.0e30
 """Mass of held nodes in the sums over pieces [kg]."""
-
-
-ITS = []
 
 
 class TriangleSolver:
@@ -119,10 +116,6 @@ class TriangleSolver:
             if not last > TOLERANCE**2 * (whole + least):
                 self._left = 0.0
                 break
-        import os
-
-        if os.environ.get("ITS"):
-            ITS.append(done + ITERATIONS_AT_ONCE)
         finish_iteration(
             cells,
             count,
@@ -413,8 +406,10 @@ def iterate(
         for k in range(own):
             i = mesh.node[k]
             w_i = nodes.inverse_mass[i]
+            product = ti.math.vec3(0.0)
             if w_i > 0.0:
-                work.a_z[i] = work.z[i] / w_i + dt * dt * gathered(k, mesh, cells, work)
+                product = work.z[i] / w_i + dt * dt * gathered(k, mesh, cells, work)
+            work.a_z[i] = product
         if ti.static(not runs_on_gpu()):
             ti.loop_config(serialize=True)
         for lane in range(share.tree.lanes):
