@@ -124,6 +124,20 @@ class TriangleWork(NamedTuple):
 
 
 @bundle
+class TriangleSystem(NamedTuple):
+    """What triangles are solved by together."""
+
+    count: ti.i32  # s
+    own: ti.i32  # o
+    chunks: ti.i32
+    pieces: ti.i32
+    cells: CellArrays
+    mesh: MeshNodes
+    frames: TriangleFrames
+    work: TriangleWork
+
+
+@bundle
 class Contraction(NamedTuple):
     """How springs of threads feel the strain across."""
 
