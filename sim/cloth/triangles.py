@@ -30,7 +30,7 @@ MOST_ITERATIONS = 200
 """More are only asked for by steps in which a wave crosses hundreds of triangles."""
 
 TOLERANCE = 0.03
-"""Of the displacement by triangles, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
+"""Of the displacement by triangles in a step, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
 
 LEAST_ACCELERATION = 1.0
 """By triangles, of which `TOLERANCE` is at least [m/s²]: 0.3 % of the weight."""
@@ -95,7 +95,7 @@ class TriangleSolver:
         self._expected = vectors(n, 2)
         self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
         self._short = is_short(count, TRIANGLE_NS) and is_short(cells.own, NODE_OF_MESH_NS)
-        self._left = self._mass = 0.0
+        self._left = self._mass = self._least = 0.0
 
     def take_parameters(self) -> None:
         """Mass as it is now; cells hold their stiffness."""
@@ -110,13 +110,17 @@ class TriangleSolver:
         share = self._sums.over(system.own)
         linearize(system, state.nodes, state.carry, dt, short)
         begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share, short)
-        self._left, least = 1.0, self._mass * (LEAST_ACCELERATION * dt * dt) ** 2
+        self._left = 1.0
+        if is_first:
+            self._least = self._mass * (LEAST_ACCELERATION * dt * dt) ** 2
         for first in range(0, MOST_ITERATIONS, ITERATIONS_AT_ONCE):
             iterate(system, state.nodes, dt, first, share, short)
             last, whole = decrease(system.work.scalars, first, first + ITERATIONS_AT_ONCE)
-            if not last > TOLERANCE**2 * (whole + least):
+            if not last > TOLERANCE**2 * (whole + self._least):
                 self._left = 0.0
                 break
+        if is_first:
+            self._least += whole
         finish_iteration(system, state.nodes, state.elastic, self._expected, short)
 
     def excess(self) -> tuple[float, int]:
