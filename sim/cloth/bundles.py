@@ -20,6 +20,7 @@ Pairs = ti.types.ndarray(dtype=Two, ndim=1)
 Triples = ti.types.ndarray(dtype=Three, ndim=1)
 Quadruples = ti.types.ndarray(dtype=Four, ndim=1)
 Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
+Strains = ti.types.ndarray(dtype=ti.math.vec2, ndim=1)
 Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 
 
@@ -72,6 +73,68 @@ class CellArrays(NamedTuple):
     along: Floats  # c_a of d_u [1/m], (arity s,)
     across: Floats  # c_a of d_v [1/m], (arity s,)
     law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
+
+
+@bundle
+class MeshNodes(NamedTuple):
+    """Nodes of s triangles, o of them, piece by piece, in chunks of about as many nodes as there are chunks."""
+
+    node: Integers  # number, (o,)
+    start: Integers  # of each node in `corner`, (o + 1,)
+    corner: Integers  # corner a of triangle s is 3 s + a
+    share: Floats  # of each corner's triangle in the strain of its node, (3 s,)
+    swapped: Integers  # as of `Cells`, (3 s,)
+    strain: Strains  # e_u and e_v of triangles, (s,)
+    mean: Strains  # of nodes, (n,)
+    piece: Integers  # (o,)
+    chunk: Integers  # first node of each chunk, and o
+    first_chunk: Integers  # of each piece, and number of chunks
+
+
+@bundle
+class TriangleFrames(NamedTuple):
+    """Along which triangles push in a step, (s,) each."""
+
+    n_u: Vectors  # direction of the warp
+    n_v: Vectors
+    by_u: Vectors  # derivatives of the shear
+    by_v: Vectors
+    turning: Weights  # tension over length that turns with warp, weft, their sum and difference [J]
+
+
+@bundle
+class TriangleWork(NamedTuple):
+    """Numbers of conjugate gradients, (s,) and (n,)."""
+
+    s_u: Vectors  # forces along d_u and d_v [J], (s,)
+    s_v: Vectors
+    start: Strains  # e_u and e_v at the start of the step, (s,)
+    start_mean: Strains  # (n,)
+    x: Vectors  # solution [m], (n,)
+    r: Vectors  # residual [kg m]
+    z: Vectors  # preconditioned residual [m]
+    a_z: Vectors  # matrix times that [kg m]
+    p: Vectors  # direction of the search [m]
+    q: Vectors  # matrix times that [kg m]
+    diagonal: Vectors  # of the inverse blocks [1/kg]
+    off_diagonal: Vectors  # their yz, xz and xy
+    scalars: Floats  # decrease by the start, then gamma and alpha of each iteration
+    moment: Weights  # of each chunk [kg m], and mass [kg]
+    shift: Vectors  # of each piece [m]
+
+
+@bundle
+class TriangleSystem(NamedTuple):
+    """What triangles are solved by together."""
+
+    count: ti.i32  # s
+    own: ti.i32  # o
+    chunks: ti.i32
+    pieces: ti.i32
+    cells: CellArrays
+    mesh: MeshNodes
+    frames: TriangleFrames
+    work: TriangleWork
 
 
 @bundle

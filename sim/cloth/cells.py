@@ -9,6 +9,10 @@ the sine of half the angle that warp and weft lack to a right one, the sheet has
 A strip that is free across has the stiffness E along warp and weft then, and contracts by nu times its strain, at any
 strain; at 45 degrees its stiffness is 4 / (1/G + 2 (1 - nu)/E). Rubber, G = E / (2 (1 + nu)), is alike in all
 directions at small strains. Threads of rectangles carry e_u and e_v (`springs`), and their cells nothing but the shear.
+
+Triangles feel the mean of the e_u and e_v of their nodes, which have the mean of their triangles, by area, but for
+`OWN_SHARE` (averaged nodal strains: Bonet, Marriott & Hassan 2001). With their own, two lengths of each triangle hardly
+change, four a node, which has but three coordinates: then they lock where they fold.
 """
 
 from __future__ import annotations
@@ -25,9 +29,6 @@ from sim.cloth.sheet import Grid, RestSheet, triangle_areas
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-STRAINS = 3
-"""Of a cell: e_u, e_v and e_s."""
-
 
 @dataclass(frozen=True, eq=False)
 class Cells:
@@ -38,6 +39,8 @@ class Cells:
         along, across: c_a of d_u and d_v [1/m], (m, arity).
         area: [m²], (m,).
         colour: (m,).
+        swapped: whether warp and weft of a cell are weft and warp of the node, (m, arity); of triangles whose node has
+            them from its first one: on curved sheets they may change places.
     """
 
     nodes: Indices
@@ -45,6 +48,7 @@ class Cells:
     across: Floats
     area: Floats
     colour: Indices
+    swapped: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -74,22 +78,38 @@ class Cells:
         length = [np.linalg.norm(d, axis=1) for d in (u, v, u + v, u - v)]
         return np.stack([length[0] - 1.0, length[1] - 1.0, (length[2] - length[3]) * np.sqrt(0.5)], axis=1)
 
+    def energies(self, positions: Floats, law: Floats) -> Floats:
+        """Of each cell [J], (m,), with nodes at positions [m], (n, 3)."""
+        strains, (stretch, shear, poisson, _) = self.strains(positions), law.T
+        energy: Floats = 0.5 * shear * strains[:, 2] ** 2
+        if self.arity == TRIANGLE:
+            means = self.at_corners(strains[:, :2], law)
+            for of_area, of_stretch in ((OWN_SHARE, strains[:, None, :2]), (1.0 - OWN_SHARE, means)):
+                u, v = of_stretch[..., 0], of_stretch[..., 1]
+                energy += of_area * 0.5 * stretch * (u * u + v * v + 2.0 * poisson[:, None] * u * v).mean(axis=1).T
+        return energy
+
+    def at_corners(self, strains: Floats, law: Floats) -> Floats:
+        """Means at the nodes of strains e_u and e_v, (m, 2), for each corner of a cell in its axes, (m, arity, 2)."""
+        turned = np.where(self.swapped[..., None], strains[:, None, ::-1], strains[:, None])
+        nodes, weight = self.nodes.ravel(), np.repeat(law[:, 0], self.arity)
+        u, v = (np.bincount(nodes, weights=weight * turned[..., axis].ravel()) for axis in (0, 1))
+        total = np.maximum(np.bincount(nodes, weights=weight), np.finfo(float).tiny)
+        means = np.stack([u / total, v / total], axis=1)[self.nodes]
+        return np.where(self.swapped[..., None], means[..., ::-1], means)
+
 
 TRIANGLE, RECTANGLE = 3, 4
 """Nodes of cells."""
+
+OWN_SHARE = 0.05
+"""Of the stiffness of triangles, that each has by itself: at none, single ones are strained by 11 % where cotton folds
+on a mesh of 15 mm, at this by 4 %, and it does not lock yet."""
 
 
 def cells_of(sheet: RestSheet) -> Cells:
     """All cells of a sheet."""
     return _between_threads(sheet.grid) if sheet.grid is not None else _triangles(sheet)
-
-
-def energies(strains: Floats, law: Floats) -> Floats:
-    """Energy of each cell [J], (m,)."""
-    u, v, shear = strains.T
-    stretch, shears, poisson, _ = law.T
-    energy: Floats = 0.5 * (stretch * (u * u + v * v + 2.0 * poisson * u * v) + shears * shear * shear)
-    return energy
 
 
 def _between_threads(grid: Grid) -> Cells:
@@ -104,6 +124,7 @@ def _between_threads(grid: Grid) -> Cells:
         np.tile(np.array([-0.5, -0.5, 0.5, 0.5]) / grid.step_y, (count, 1)),
         np.full(count, grid.step_x * grid.step_y),
         (2 * (j % 2) + i % 2).astype(np.int32),
+        np.zeros((count, RECTANGLE), dtype=bool),
     )
 
 
@@ -124,4 +145,17 @@ def _triangles(sheet: RestSheet) -> Cells:
         across,
         triangle_areas(sheet.vertices, sheet.triangles),
         greedy_colours(nodes, len(sheet.vertices)),
+        _swapped(sheet, normal),
     )
+
+
+def _swapped(sheet: RestSheet, normal: Floats) -> NDArray[np.bool_]:
+    """`Cells.swapped` of triangles with these unit normals, (k, 3)."""
+    first = np.zeros(len(sheet.vertices), dtype=np.int64)
+    first[sheet.triangles[::-1]] = np.arange(len(sheet.triangles))[::-1, None]
+    first = first[sheet.triangles]
+    along, across = (
+        np.abs(np.einsum("ki,kai->ka", sheet.warp, axis[first])) for axis in (sheet.warp, np.cross(normal, sheet.warp))
+    )
+    is_swapped: NDArray[np.bool_] = along < across
+    return is_swapped

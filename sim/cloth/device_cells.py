@@ -1,16 +1,18 @@
 """Cells on the device, with the law that the parameters of the moment give them, for XPBD and explicit steps."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import CellArrays, NodeMotion, Nodes
-from sim.cloth.cells import RECTANGLE, STRAINS, TRIANGLE, Cells, energies
+from sim.cloth.bundles import CellArrays, MeshNodes, NodeMotion, Nodes, Strains
+from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
 from sim.cloth.device_springs import TINY_LENGTH, colour_bounds, colour_groups
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.spring_convergence import LARGEST_RESIDUAL
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
@@ -31,8 +33,10 @@ class DeviceCells:
         law: as `Cells.law` has it, (count, 4).
         cloths: numbers of the cloths that they belong to.
         first_colours: first colour of each group of `COLOURS_AT_ONCE`; the last group may have empty ones.
+        mesh: nodes of triangles; nothing of rectangles.
+        own, chunks, pieces: how many nodes, chunks and pieces those are.
         cell_of_colour: first cell of each colour, and number of cells, (colours + 1,).
-        multiplier: of each strain, (count * STRAINS,).
+        multiplier: of the shear, (count,); rectangles only.
     """
 
     def __init__(self, cells: Cells, cloth_of: NDArray[np.int32]) -> None:
@@ -41,11 +45,12 @@ class DeviceCells:
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
         self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
-        self.multiplier = ti.ndarray(ti.f32, self.count * STRAINS)
+        self.multiplier = ti.ndarray(ti.f32, self.count)
         nodes, along, across = (ti.ndarray(kind, self.count * self.arity) for kind in (ti.i32, ti.f32, ti.f32))
         nodes.from_numpy(np.ascontiguousarray(cells.nodes).ravel())
         along.from_numpy(cells.along.astype(np.float32).ravel())
         across.from_numpy(cells.across.astype(np.float32).ravel())
+        self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
         self.on_device = CellArrays(nodes, along, across, ti.Vector.ndarray(4, ti.f32, self.count))
 
     @property
@@ -59,10 +64,55 @@ class DeviceCells:
             own = self._cloth_of == number
             self.law[own] = self.host.law(cloth)[own]
         self.on_device.law.from_numpy(self.law.astype(np.float32))
+        if self.arity == TRIANGLE:
+            nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)
+            self.mesh.share.from_numpy((weight / np.bincount(nodes, weights=weight)[nodes]).astype(np.float32))
 
     def energy(self, positions: NDArray[np.float64]) -> float:
         """Elastic energy [J], in float64."""
-        return float(energies(self.host.strains(positions), self.law).sum())
+        return float(self.host.energies(positions, self.law).sum())
+
+    def measure_strains(self, nodes: Nodes, motion: NodeMotion, *, is_damped: bool) -> None:
+        """Mean strains of the nodes of triangles, as `motion` has carried them, with what damping adds to them."""
+        if self.arity == TRIANGLE:
+            measure_strains(self.on_device, self.count, self.mesh, self.own, nodes, motion, int(is_damped))
+
+
+def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
+    """The nodes of triangles, connected piece by piece; how many nodes, chunks and pieces."""
+    triangles = cells.nodes if cells.arity == TRIANGLE else np.zeros((0, TRIANGLE), dtype=np.int32)
+    count = int(triangles.max(initial=-1)) + 1
+    a, b, c = triangles.T
+    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
+    label = connected_components(links, directed=False)[1] if count else np.zeros(0, dtype=np.int32)
+    used = np.unique(triangles)
+    own = used[np.argsort(label[used], kind="stable")]
+    piece = np.unique(label[own], return_inverse=True)[1]
+    place = np.zeros(count, dtype=np.int64)
+    place[own] = np.arange(len(own))
+    place = place[triangles.ravel()]
+    ends, size = np.append(0, np.cumsum(np.bincount(piece))), max(1, round(len(own) ** 0.5))
+    chunks = [np.arange(first, end, size) for first, end in pairwise(ends)]
+    first = np.concatenate([*chunks, [len(own)]])
+    mesh = MeshNodes(
+        node=_integers(own),
+        start=_integers(np.append(0, np.cumsum(np.bincount(place)))),
+        corner=_integers(np.argsort(place, kind="stable")),
+        share=ti.ndarray(ti.f32, max(triangles.size, 1)),
+        swapped=_integers(cells.swapped.ravel()),
+        strain=ti.Vector.ndarray(2, ti.f32, max(len(triangles), 1)),
+        mean=ti.Vector.ndarray(2, ti.f32, max(count, 1)),
+        piece=_integers(piece),
+        chunk=_integers(first),
+        first_chunk=_integers(np.append(0, np.cumsum([len(chunk) for chunk in chunks]))),
+    )
+    return mesh, len(own), len(first) - 1, len(chunks)
+
+
+def _integers(values: NDArray[np.generic]) -> ti.Ndarray:
+    array = ti.ndarray(ti.i32, max(len(values), 1))
+    array.from_numpy(np.resize(values, max(len(values), 1)).astype(np.int32))
+    return array
 
 
 @func
@@ -146,54 +196,21 @@ def push_nodes(
 
 
 @func
-def solve_cell(
-    s: ti.i32,
-    cells: CellArrays,
-    nodes: Nodes,
-    dt_squared: ti.f32,
-    is_first: ti.i32,
-    multiplier: Floats,
-    arity: ti.template(),
-):
-    """Strain by strain, Macklin, Müller & Chentanez 2016, eq. 18, multiplied through by k dt².
-
-    With nu times the strain across, warp and weft have the tension C (e_u + nu e_v): each takes the other as it is.
-    """
-    d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, arity)
-    d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, arity)
-    w = weights(cells, nodes, s, arity)
-    p_u, p_v = ti.math.vec3(0.0), ti.math.vec3(0.0)
-    law = cells.law[s]
-    if ti.static(arity == TRIANGLE):
-        strength = law[0] * dt_squared
-        length, length_across = ti.max(d_u.norm(), TINY_LENGTH), d_v.norm()
-        before = ti.select(is_first, 0.0, multiplier[STRAINS * s])
-        strain = length - 1.0 + law[2] * (length_across - 1.0)
-        change = -(strength * strain + before) / (strength * w[0] + 1.0)
-        multiplier[STRAINS * s] = before + change
-        p_u = change / length * d_u
-        d_v += w[2] * p_u
-        d_u += w[0] * p_u
-        length, length_across = d_u.norm(), ti.max(d_v.norm(), TINY_LENGTH)
-        before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 1])
-        strain = length_across - 1.0 + law[2] * (length - 1.0)
-        change = -(strength * strain + before) / (strength * w[1] + 1.0)
-        multiplier[STRAINS * s + 1] = before + change
-        p_v = change / length_across * d_v
-        d_u += w[2] * p_v
-        d_v += w[1] * p_v
+def solve_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: ti.i32, multiplier: Floats):
+    """The shear of a cell of a rectangle, by Macklin, Müller & Chentanez 2016, eq. 18, multiplied through by k dt²."""
+    d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, RECTANGLE)
+    d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE)
     shear, by_u, by_v = shear_of(d_u, d_v)
-    strength, weight = law[1] * dt_squared, weight_along(by_u, by_v, w)
-    before = ti.select(is_first, 0.0, multiplier[STRAINS * s + 2])
-    change = -(strength * shear + before) / (strength * weight + 1.0)
-    if ti.static(arity == RECTANGLE):
-        change *= over_relaxed(strength * weight)
-    multiplier[STRAINS * s + 2] = before + change
-    push_nodes(s, cells, nodes, p_u + change * by_u, p_v + change * by_v, nodes.displacement, arity)
+    strength = cells.law[s][1] * dt_squared
+    stiffness = strength * weight_along(by_u, by_v, weights(cells, nodes, s, RECTANGLE))
+    before = ti.select(is_first, 0.0, multiplier[s])
+    change = -over_relaxed(stiffness) * (strength * shear + before) / (stiffness + 1.0)
+    multiplier[s] = before + change
+    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.displacement, RECTANGLE)
 
 
 @kernel
-def solve_cells(
+def solve_shears(
     cells: CellArrays,
     cell_of_colour: Integers,
     colour: ti.i32,
@@ -201,39 +218,28 @@ def solve_cells(
     dt_squared: ti.f32,
     is_first: ti.i32,
     multiplier: Floats,
-    arity: ti.template(),
 ):
     """The cells of some colours, from `colour` on, one colour after the other; multipliers start at 0 if `is_first`."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     s0, s1, s2, s3, s4 = colour_bounds(cell_of_colour, colour)
     for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
         for s in range(start, stop):
-            solve_cell(s, cells, nodes, dt_squared, is_first, multiplier, arity)
+            solve_shear(s, cells, nodes, dt_squared, is_first, multiplier)
 
 
 @func
 def damp_cell(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, arity: ti.template()):
-    """Implicit Euler of the forces -tau k de/dt, strain by strain."""
+    """Implicit Euler of the force -tau k de/dt of the shear."""
     d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
     d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
     w = weights(cells, nodes, s, arity)
     law = cells.law[s]
     rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
     rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
-    p_u, p_v = ti.math.vec3(0.0), ti.math.vec3(0.0)
-    if ti.static(arity == TRIANGLE):
-        strength = law[0] * law[3] * dt
-        n_u, n_v = d_u / ti.max(d_u.norm(), TINY_LENGTH), d_v / ti.max(d_v.norm(), TINY_LENGTH)
-        p_u = -strength * (n_u.dot(rate_u) + law[2] * n_v.dot(rate_v)) / (strength * w[0] + 1.0) * n_u
-        rate_u += w[0] * p_u
-        rate_v += w[2] * p_u
-        p_v = -strength * (n_v.dot(rate_v) + law[2] * n_u.dot(rate_u)) / (strength * w[1] + 1.0) * n_v
-        rate_u += w[2] * p_v
-        rate_v += w[1] * p_v
     _, by_u, by_v = shear_of(d_u, d_v)
     strength, weight = law[1] * law[3] * dt, weight_along(by_u, by_v, w)
     change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v)) / (strength * weight + 1.0)
-    push_nodes(s, cells, nodes, p_u + change * by_u, p_v + change * by_v, motion.velocity, arity)
+    push_nodes(s, cells, nodes, change * by_u, change * by_v, motion.velocity, arity)
 
 
 @kernel
@@ -254,9 +260,55 @@ def damp_cells(
             damp_cell(s, cells, nodes, motion, dt, arity)
 
 
+@func
+def mean_strain(k: ti.i32, mesh: MeshNodes, strain: Strains) -> ti.math.vec2:
+    """e_u and e_v of a node: the mean of its triangles, by area."""
+    total = ti.math.vec2(0.0)
+    for at in range(mesh.start[k], mesh.start[k + 1]):
+        corner = mesh.corner[at]
+        own = strain[corner // TRIANGLE]
+        total += mesh.share[corner] * ti.select(mesh.swapped[corner], own.yx, own)
+    return total
+
+
+@func
+def tension_of(s: ti.i32, cells: CellArrays, mesh: MeshNodes, strain: Strains, mean: Strains) -> ti.math.vec2:
+    """Tensions of a triangle along warp and weft [J], from its own strain and the mean ones of its nodes."""
+    felt = OWN_SHARE * strain[s]
+    for a in ti.static(range(TRIANGLE)):
+        of_node = mean[cells.nodes[TRIANGLE * s + a]]
+        felt += (1.0 - OWN_SHARE) / TRIANGLE * ti.select(mesh.swapped[TRIANGLE * s + a], of_node.yx, of_node)
+    return cells.law[s][0] * (felt + cells.law[s][2] * felt.yx)
+
+
+@kernel
+def measure_strains(
+    cells: CellArrays,
+    count: ti.i32,
+    mesh: MeshNodes,
+    own: ti.i32,
+    nodes: Nodes,
+    motion: NodeMotion,
+    is_damped: ti.i32,
+):
+    """Strains of triangles, with tau times their rates if `is_damped`; then of nodes."""
+    for s in range(count):
+        d_u = derivative(cells.along, cells, nodes, motion.carry, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, motion.carry, s, TRIANGLE)
+        length, length_across = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
+        mesh.strain[s] = ti.math.vec2(length - 1.0, length_across - 1.0)
+        if is_damped:
+            rate_u = d_u.dot(velocity_derivative(cells.along, cells, motion, s, TRIANGLE)) / length
+            rate_v = d_v.dot(velocity_derivative(cells.across, cells, motion, s, TRIANGLE)) / length_across
+            mesh.strain[s] = mesh.strain[s] + cells.law[s][3] * ti.math.vec2(rate_u, rate_v)
+    for k in range(own):
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+
+
 @kernel
 def compute_cell_forces(
     cells: CellArrays,
+    mesh: MeshNodes,
     nodes: Nodes,
     motion: NodeMotion,
     first: ti.i32,
@@ -264,7 +316,9 @@ def compute_cell_forces(
     arity: ti.template(),
     force: Vectors,
 ):
-    """-dW/dd_u and -dW/dd_v of each cell with damping [N m], one after the other from `first` on."""
+    """-dW/dd_u and -dW/dd_v of each cell with damping [N m], one after the other from `first` on, after
+    `measure_strains`.
+    """
     for s in range(count):
         d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
         d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
@@ -275,51 +329,18 @@ def compute_cell_forces(
         moment = -law[1] * (shear + law[3] * (by_u.dot(rate_u) + by_v.dot(rate_v)))
         f_u, f_v = moment * by_u, moment * by_v
         if ti.static(arity == TRIANGLE):
-            length, length_across = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
-            n_u, n_v = d_u / length, d_v / length_across
-            e_u = length - 1.0 + law[3] * n_u.dot(rate_u)
-            e_v = length_across - 1.0 + law[3] * n_v.dot(rate_v)
-            f_u -= law[0] * (e_u + law[2] * e_v) * n_u
-            f_v -= law[0] * (e_v + law[2] * e_u) * n_v
+            tension = tension_of(s, cells, mesh, mesh.strain, mesh.mean)
+            f_u -= tension[0] / ti.max(d_u.norm(), TINY_LENGTH) * d_u
+            f_v -= tension[1] / ti.max(d_v.norm(), TINY_LENGTH) * d_v
         force[first + 2 * s] = f_u
         force[first + 2 * s + 1] = f_v
 
 
 @kernel
-def measure_cell_excess(
-    cells: CellArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, share: Share
-) -> Results:
-    """Largest excess of triangles along warp and weft, as `spring_convergence` has it, and how many of both are beyond
-    `LARGEST_RESIDUAL`.
-    """
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
-        largest, unconverged = 0.0, 0.0
-        for k in range(share.items):
-            s = lane * share.lane_step + k * share.item_step
-            if s < count:
-                e_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
-                e_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE).norm() - 1.0
-                law = cells.law[s]
-                w = weights(cells, nodes, s, TRIANGLE)
-                if w[0] > 0.0:
-                    excess = e_u + law[2] * e_v + multiplier[STRAINS * s] / (law[0] * dt_squared)
-                    across = e_v + law[2] * e_u + multiplier[STRAINS * s + 1] / (law[0] * dt_squared)
-                    largest = ti.max(largest, excess, across)
-                    if excess > LARGEST_RESIDUAL:
-                        unconverged += 1.0
-                    if across > LARGEST_RESIDUAL:
-                        unconverged += 1.0
-        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
-    return reduced_tree(share.tree)
-
-
-@kernel
 def sum_over_cells(
-    cells: CellArrays, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
+    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
 ) -> Results:
-    """Largest strain of triangles along warp and weft; elastic energy."""
+    """Largest mean strain of nodes of triangles along warp and weft; elastic energy; after `measure_strains`."""
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(share.tree.lanes):
@@ -334,9 +355,13 @@ def sum_over_cells(
                 shear, _, _ = shear_of(d_u, d_v)
                 energy += 0.5 * law[1] * shear * shear
                 if ti.static(arity == TRIANGLE):
-                    e_u, e_v = d_u.norm() - 1.0, d_v.norm() - 1.0
-                    energy += 0.5 * law[0] * (e_u * e_u + e_v * e_v + 2.0 * law[2] * e_u * e_v)
-                    largest = ti.max(largest, e_u, e_v)
+                    e = mesh.strain[s]
+                    energy += 0.5 * OWN_SHARE * law[0] * (e.dot(e) + 2.0 * law[2] * e.x * e.y)
+                    for a in ti.static(range(TRIANGLE)):
+                        e = mesh.mean[cells.nodes[TRIANGLE * s + a]]
+                        largest = ti.max(largest, e.x, e.y)
+                        share_of_node = 0.5 * (1.0 - OWN_SHARE) / TRIANGLE
+                        energy += share_of_node * law[0] * (e.dot(e) + 2.0 * law[2] * e.x * e.y)
         share.tree.partial[lane] = largest
         share.tree.partial[share.tree.lanes + lane] = energy
     return reduced_tree(share.tree)

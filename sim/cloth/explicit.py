@@ -78,8 +78,16 @@ class ExplicitSprings:
                 springs.on_device, state.nodes, state.motion, int(first), springs.count, springs.arity, self._force
             )
         for first, cells in zip(self._first[len(self._springs) :], self._cells, strict=False):
+            cells.measure_strains(state.nodes, state.motion, is_damped=True)
             compute_cell_forces(
-                cells.on_device, state.nodes, state.motion, int(first), cells.count, cells.arity, self._force
+                cells.on_device,
+                cells.mesh,
+                state.nodes,
+                state.motion,
+                int(first),
+                cells.count,
+                cells.arity,
+                self._force,
             )
         gather_spring_forces(
             self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity

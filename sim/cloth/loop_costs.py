@@ -6,3 +6,6 @@ roughly, as are those below, from processor times at 128 x 128 nodes."""
 
 CONTACT_NS = 25.0
 """Work of one step of the iteration a contact [ns]."""
+
+TRIANGLE_NS, NODE_OF_MESH_NS = 40.0, 60.0
+"""Work of one iteration of conjugate gradients a triangle, and a node [ns]."""

@@ -106,7 +106,7 @@ def solve_cells_in_rows(
     is_first: ti.i32,
     is_short: ti.template(),
 ):
-    """The shear of all cells in every second row of cells, from row `parity` on; `solve_cell` has the formula.
+    """The shear of all cells in every second row of cells, from row `parity` on; `solve_shear` has the formula.
 
     In each row every second cell first, then those between, which share nodes with them: all are computed alike, eight
     at a time, and every second one acts. `steps` are the lengths of a cell [m], `stiffness` is G times its area [J].

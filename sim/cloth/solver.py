@@ -442,7 +442,7 @@ class ClothSolver:
         return f"max_speed is {speed:.3g} m/s" if speed > RUNAWAY_SPEED else None
 
 
-_STATE = {"lattice": np.int32, "carry": np.float32, "velocity": np.float32}
+_STATE = {"lattice": np.int32, "carry": np.float32, "velocity": np.float32, "elastic": np.float32}
 """Arrays of the state that a restart needs, each (n, 3)."""
 
 

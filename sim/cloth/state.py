@@ -107,6 +107,7 @@ class ClothState:
         carry: what the lattice lacks [m], (n,) vec3, at most half a quantum.
         displacement: from the lattice's position to the end of the substep, `carry` included [m], (n,) vec3.
         velocity: [m/s], (n,) vec3.
+        elastic: by how much triangles of meshes displaced nodes in the last step [m], (n,) vec3; 0 elsewhere.
         mass: of a node [kg], (n,), pinned or not.
         inverse_mass: [1/kg], (n,); 0 where a node is pinned.
         thickness: distance that layers keep [m], (n,).
@@ -138,6 +139,8 @@ class ClothState:
         self.carry = ti.Vector.ndarray(3, ti.f32, n)
         self.displacement = ti.Vector.ndarray(3, ti.f32, n)
         self.velocity = ti.Vector.ndarray(3, ti.f32, n)
+        self.elastic = ti.Vector.ndarray(3, ti.f32, n)
+        self.elastic.fill(0.0)
         self.mass = ti.ndarray(ti.f32, n)
         self.inverse_mass = ti.ndarray(ti.f32, n)
         self.thickness = ti.ndarray(ti.f32, n)

@@ -64,9 +64,11 @@ class ClothTotals:
             )
             strain, energy = max(strain, float(results[0])), energy + float(results[1])
         for cells in self._cells:
+            cells.measure_strains(state.nodes, state.motion, is_damped=False)
             results = self._of_springs.unpack(
                 sum_over_cells(
                     cells.on_device,
+                    cells.mesh,
                     state.nodes,
                     state.carry,
                     cells.count,

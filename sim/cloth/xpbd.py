@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from sim.cloth.angular_momentum import AngularMomentumCorrection
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
-from sim.cloth.device_cells import SHEAR_SWEEPS, DeviceCells, damp_cells, measure_cell_excess, solve_cells
+from sim.cloth.device_cells import SHEAR_SWEEPS, DeviceCells, damp_cells, solve_shears
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
+from sim.cloth.triangles import TriangleSolver
 from sim.core.arrays import Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import LaneReduction
 
 PAIR, BEND_OF_GRID = 2, 3
 """Nodes of springs: of an ordinary one, and of one over a node of a rectangle, which is flat at rest."""
@@ -48,20 +48,24 @@ class XPBDSprings:
         self._state, self._springs, self._cells = state, springs, cells
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
-        self._of_cells = LaneReduction(maxima=1, sums=1)
         self._rectangles = {
             number: RectangleSprings(state, grid, int(state.host.first_node[number]))
             for number, grid in rectangles_in_rows(state.host).items()
         }
         listed = [family for family in springs if not family.cloths & self._rectangles.keys()]
         self._bends = [family for family in listed if family.arity > PAIR]
-        self._solved_cells = [family for family in cells if not family.cloths & self._rectangles.keys()]
+        self._shears = [
+            family for family in cells if family.arity != TRIANGLE and not family.cloths & self._rectangles.keys()
+        ]
+        self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
         self._threads = [ThreadSolver(family) for family in listed if family.in_segments]
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
-        """Stiffness of the rectangles as it is now; lists of springs hold theirs."""
+        """Stiffness of rectangles and mass of meshes as they are now; lists of springs hold their stiffness."""
         for number, rectangle in self._rectangles.items():
             rectangle.take_parameters(cloths[number])
+        for triangles in self._triangles:
+            triangles.take_parameters()
 
     def excess(self, dt: float) -> NDArray[np.float64]:
         """By how much a spring of threads and edges is longer than its tension makes it, at most [rest lengths].
@@ -70,13 +74,7 @@ class XPBDSprings:
         """
         found = [(threads.springs.cloths, *threads.excess(self._state, dt)) for threads in self._threads]
         found += [({number}, *rectangle.excess(dt)) for number, rectangle in self._rectangles.items()]
-        for cells in self._solved_cells:
-            if cells.arity == TRIANGLE:
-                share = self._of_cells.over(cells.count)
-                result = measure_cell_excess(
-                    cells.on_device, cells.count, cells.multiplier, self._state.nodes, dt * dt, share
-                )
-                found.append((cells.cloths, float(result[0]), int(result[1])))
+        found += [(triangles.cloths, *triangles.excess()) for triangles in self._triangles]
         self._unconverged = sum(count for *_, count in found)
         largest = np.zeros(len(self._state.names))
         for cloths, excess, _ in found:
@@ -92,7 +90,7 @@ class XPBDSprings:
         return float("inf")
 
     def accelerate(self, dt: float) -> None:
-        """Damp the velocities along springs between two nodes.
+        """Damp the velocities along springs between two nodes, and in the shear of rectangles.
 
         Apart from their own sweep: there, a damping of gamma = tau / dt (Macklin et al. 2016, eq. 26) also brakes what
         the sweep has to undo of the prediction, and makes their largest stiffness 1 + gamma times smaller. Bend springs
@@ -114,7 +112,7 @@ class XPBDSprings:
                     springs.arity,
                 )
         for cells in self._cells:
-            if cells.is_damped:
+            if cells.arity != TRIANGLE and cells.is_damped:
                 for colour in cells.first_colours:
                     damp_cells(
                         cells.on_device, cells.cell_of_colour, colour, state.nodes, state.motion, dt, cells.arity
@@ -125,7 +123,7 @@ class XPBDSprings:
         for springs in self._bends:
             self._solve_bends(springs, dt)
         for sweep in range(sweeps.max()):
-            self._sweep_lists(self._solved_cells, dt, sweeps > sweep, is_first=sweep == 0)
+            self._sweep_lists(self._shears, dt, sweeps > sweep, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
         for number, rectangle in self._rectangles.items():
@@ -135,8 +133,7 @@ class XPBDSprings:
     def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
         """Solve what bears tension in some cloths once more, after contacts have pushed: threads, and the triangles of
         meshes."""
-        triangles = [cells for cells in self._solved_cells if cells.arity == TRIANGLE]
-        self._sweep_lists(triangles, dt, cloths, is_first=False)
+        self._sweep_lists([], dt, cloths, is_first=False)
         for number, rectangle in self._rectangles.items():
             if cloths[number]:
                 rectangle.sweep(dt)
@@ -148,9 +145,8 @@ class XPBDSprings:
         for cells in solved:
             if not cloths[list(cells.cloths)].any():
                 continue
-            sweeps = 1 if cells.arity == TRIANGLE else SHEAR_SWEEPS
-            for time, colour in product(range(sweeps), cells.first_colours):
-                solve_cells(
+            for time, colour in product(range(SHEAR_SWEEPS), cells.first_colours):
+                solve_shears(
                     cells.on_device,
                     cells.cell_of_colour,
                     colour,
@@ -158,11 +154,13 @@ class XPBDSprings:
                     dt * dt,
                     int(is_first and time == 0),
                     cells.multiplier,
-                    cells.arity,
                 )
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
                 threads.displace(self._state, dt, is_first=is_first)
+        for triangles in self._triangles:
+            if cloths[list(triangles.cloths)].any():
+                triangles.displace(dt, is_first=is_first)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
         state = self._state

@@ -18,7 +18,7 @@ from cloth_scenes import (
     solver_of,
 )
 
-from sim.cloth.cells import cells_of, energies
+from sim.cloth.cells import cells_of
 from sim.cloth.parameters import RectangleSheet
 from sim.cloth.sheet import build_sheet, sheet_of_triangles
 from sim.cloth.springs import springs_of
@@ -150,9 +150,9 @@ def go(solver, frames: int) -> list[float]:
 
 @pytest.mark.usefixtures("taichi_cpu")
 def test_cotton_drapes_alike_as_rectangle_and_as_mesh(tmp_path):
-    """0.3 m that hang from their middle, within 5 %: folds fall otherwise, by 4 %, where the same mesh is turned.
+    """0.3 m that hang from their middle, within 3 %.
 
-    Networks of edges hang 9 % less far down.
+    Networks of edges hang 9 % less far down, coarse triangles that feel their own strains alone 11 %.
     """
     pin = [{"region": {"type": "sphere", "position": (0, 0, 0), "radius": 1e-4}}]
     mean = {}
@@ -169,7 +169,7 @@ def test_cotton_drapes_alike_as_rectangle_and_as_mesh(tmp_path):
         solver = solver_of(cloth(shape=shape, pin=pin, self_collision=False, **turned), gravity=EARTH)
         mean[name] = np.mean(go(solver, 120)[-30:])
     spread = (max(mean.values()) - min(mean.values())) / np.mean(list(mean.values()))
-    assert spread < 0.05, mean
+    assert spread < 0.03, mean
 
 
 @pytest.mark.usefixtures("taichi_cpu")
@@ -222,5 +222,5 @@ def test_rest_has_no_energy():
     for name in SHEETS:
         sheet, _ = sheet_of(name)
         cells = cells_of(sheet)
-        assert energies(cells.strains(sheet.vertices), cells.law(cloth(**LAW))).sum() < 1e-18
+        assert cells.energies(sheet.vertices, cells.law(cloth(**LAW))).sum() < 1e-18
         assert len(springs_of(sheet)) == (2 if sheet.grid else 1)

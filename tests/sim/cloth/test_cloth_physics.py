@@ -91,17 +91,15 @@ def test_a_mesh_hangs_as_far_down_as_its_stiffness_lets_it(tmp_path):
     path = tmp_path / "sheet.stl"
     trimesh.Trimesh(vertices, triangles, process=False).export(path)
     top = {"type": "box", "min": (-1, -1, 0.499), "max": (1, 1, 0.501)}
-    keys = {"bend_stiffness": 0.0, "damping": 2e-3, "substeps": 200, **VACUUM}
+    keys = {"bend_stiffness": 0.0, "damping": 2e-3, **VACUUM}
     solver = solver_of(cloth(shape={"type": "mesh", "file": str(path)}, pin=[{"region": top}], **keys))
     start = solver.state.positions()
-    settle(solver, 12, 400)
+    settle(solver, 12, 40)
     x = solver.state.positions()
     lowest = start[:, 2] < -0.499
     inner = lowest & (np.abs(start[:, 0]) < 0.25)
     longer = (start[inner, 2] - x[inner, 2]).mean()
-    # Triangles are solved one by one: a metre gets 1.4 mm longer at 20 steps, and what is too much of it falls with the
-    # square of the step.
-    assert longer == pytest.approx(0.15 * GRAVITY / (2.0 * 4000.0), rel=0.15)
+    assert longer == pytest.approx(0.15 * GRAVITY / (2.0 * 4000.0), rel=0.05)
 
 
 def test_a_taut_strip_does_not_jitter_across():

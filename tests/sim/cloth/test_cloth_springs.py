@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cloth_scenes import cloth
 
-from sim.cloth.cells import cells_of, energies
+from sim.cloth.cells import cells_of
 from sim.cloth.colouring import greedy_colours
 from sim.cloth.parameters import RectangleSheet
 from sim.cloth.sheet import RestSheet, build_sheet, sheet_of_triangles
@@ -43,7 +43,7 @@ def elastic_energy(sheet: RestSheet, deform, **keys) -> float:
         stretch = np.linalg.norm(lever, axis=1) - springs.rest
         total += float((0.5 * springs.stiffness(parameters) * stretch**2).sum())
     cells = cells_of(sheet)
-    return total + float(energies(cells.strains(positions), cells.law(parameters)).sum())
+    return total + float(cells.energies(positions, cells.law(parameters)).sum())
 
 
 def rolled(curvature, angle=0.0):

@@ -1,0 +1,512 @@
+"""Triangles of meshes, solved together in every step: one Newton step of implicit Euler by conjugate gradients."""
+
+import taichi as ti
+
+from sim.cloth.bundles import (
+    CellArrays,
+    Nodes,
+    Strains,
+    TriangleFrames,
+    TriangleSystem,
+    TriangleWork,
+)
+from sim.cloth.cells import OWN_SHARE, TRIANGLE
+from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
+from sim.cloth.device_springs import TINY_LENGTH
+from sim.cloth.loop_costs import NODE_OF_MESH_NS, TRIANGLE_NS
+from sim.cloth.spring_convergence import LARGEST_RESIDUAL
+from sim.cloth.state import ClothState
+from sim.cloth.threads import STRAIGHTENED, direction_of
+from sim.core.arrays import Floats, Vectors
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.reductions import BRANCHES, LaneReduction, Results, Share, reduced_tree, runs_on_gpu
+from sim.core.scheduling import is_short
+
+ITERATIONS_AT_ONCE = 4
+"""Iterations between two looks at how far the last ones led."""
+
+MOST_ITERATIONS = 200
+"""More are only asked for by steps in which a wave crosses hundreds of triangles."""
+
+TOLERANCE = 0.03
+"""Of the displacement by triangles in a step, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
+
+LEAST_ACCELERATION = 1.0
+"""By triangles, of which `TOLERANCE` is at least [m/s²]: 0.3 % of the weight."""
+
+ROOT_HALF = 0.5**0.5
+
+BLOCK_SHARE = OWN_SHARE + (1.0 - OWN_SHARE) / 6.0
+"""What blocks of nodes have of the stiffness of triangles, on equal triangles."""
+
+TINY_ENERGY = 1.0e-37
+"""Least divisor of energies [kg m²]: without any, there is nothing to solve."""
+
+HELD = 1.0e30
+"""Mass of held nodes in the sums over pieces [kg]."""
+
+
+class TriangleSolver:
+    """(M + dt² K) e = -dt² f for the displacements e by the triangles of all meshes, f and K at the prediction.
+
+    Forces push along the directions of the start, as threads do (`threads`), so that K consists of the stiffnesses
+    along these, and of Newmark's beta of the tension that turns with them. Damping is part of both. Conjugate gradients
+    with the inverse 3 x 3 blocks B of the nodes (Baraff & Witkin 1998, "Large steps in cloth simulation"), with one
+    reduction an iteration (Chronopoulos & Gear 1989). They start from the multiple of the displacement of the step
+    before that leaves the least energy: what rests stays at rest, however few they are. Their number falls with dt: a
+    wave crosses dt (E/rho)^(1/2) in a step, 14 edges of 1 cm of cotton.
+
+    What iterations leave of linear momentum is taken from each piece of a mesh that no pin holds.
+
+    Attributes:
+        cloths: numbers of those that they belong to.
+
+    Args:
+        state: what they move.
+        cells: the triangles.
+    """
+
+    def __init__(self, state: ClothState, cells: DeviceCells) -> None:
+        self._state, self.cloths = state, cells.cloths
+        count, n = cells.count, state.vertex_count
+
+        def vectors(size: int, length: int = 3) -> ti.Ndarray:
+            array = ti.Vector.ndarray(length, ti.f32, size)
+            array.fill(0.0)
+            return array
+
+        scalars = ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 1)
+        scalars.fill(0.0)
+        self._system = TriangleSystem(
+            count,
+            cells.own,
+            cells.chunks,
+            cells.pieces,
+            cells.on_device,
+            cells.mesh,
+            TriangleFrames(*(vectors(count) for _ in range(4)), vectors(count, 4)),
+            TriangleWork(
+                *(vectors(count) for _ in range(2)),
+                *(vectors(size, 2) for size in (count, n)),
+                *(vectors(n) for _ in range(8)),
+                scalars,
+                vectors(cells.chunks, 4),
+                vectors(cells.pieces),
+            ),
+        )
+        self._expected = vectors(n, 2)
+        self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
+        self._short = is_short(count, TRIANGLE_NS) and is_short(cells.own, NODE_OF_MESH_NS)
+        self._left = self._mass = self._least = 0.0
+
+    def take_parameters(self) -> None:
+        """Mass as it is now; cells hold their stiffness."""
+        self._mass = float(self._state.mass.to_numpy()[self._system.mesh.node.to_numpy()].sum())
+
+    def displace(self, dt: float, *, is_first: bool) -> None:
+        """Bring the displacements of a step of dt [s] to where the triangles let them go.
+
+        Once more in a step: from where the nodes are now, with what triangles pushed them by so far as an impulse.
+        """
+        system, state, short = self._system, self._state, self._short
+        share = self._sums.over(system.own)
+        linearize(system, state.nodes, state.carry, dt, short)
+        begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share, short)
+        self._left = 1.0
+        if is_first:
+            self._least = self._mass * (LEAST_ACCELERATION * dt * dt) ** 2
+        for first in range(0, MOST_ITERATIONS, ITERATIONS_AT_ONCE):
+            iterate(system, state.nodes, dt, first, share, short)
+            last, whole = decrease(system.work.scalars, first, first + ITERATIONS_AT_ONCE)
+            if not last > TOLERANCE**2 * (whole + self._least):
+                self._left = 0.0
+                break
+        if is_first:
+            self._least += whole
+        finish_iteration(system, state.nodes, state.elastic, self._expected, short)
+
+    def excess(self) -> tuple[float, int]:
+        """Largest excess of strain at a node [-], 1 if `MOST_ITERATIONS` were too few; and how many are beyond
+        `LARGEST_RESIDUAL`.
+        """
+        share = self._of_excess.over(self._system.own)
+        found = measure_node_excess(self._system, self._state.nodes, self._expected, share, self._short)
+        return max(float(found[0]), self._left), int(found[1])
+
+
+@func
+def stiffer(s: ti.i32, cells: CellArrays, rate: ti.f32) -> ti.f32:
+    """By what damping multiplies the stiffness of a step of 1/`rate`."""
+    return 1.0 + cells.law[s][3] * rate
+
+
+@func
+def strain(s: ti.i32, system: TriangleSystem, moved: Vectors, rate: ti.f32) -> ti.math.vec2:
+    """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `work`."""
+    d_u = change_of(system.cells.along, system.cells, moved, s)
+    d_v = change_of(system.cells.across, system.cells, moved, s)
+    n_u, n_v, turning = system.frames.n_u[s], system.frames.n_v[s], system.frames.turning[s]
+    by_u, by_v = system.frames.by_u[s], system.frames.by_v[s]
+    e_u, e_v = n_u.dot(d_u), n_v.dot(d_v)
+    shear = stiffer(s, system.cells, rate) * system.cells.law[s][1] * (by_u.dot(d_u) + by_v.dot(d_v))
+    more, less = ROOT_HALF * (by_u + by_v), ROOT_HALF * (by_v - by_u)
+    d_more, d_less = d_u + d_v, d_u - d_v
+    s_more = turning[2] * (d_more - more.dot(d_more) * more)
+    s_less = turning[3] * (d_less - less.dot(d_less) * less)
+    system.work.s_u[s] = shear * by_u + turning[0] * (d_u - e_u * n_u) + (s_more + s_less)
+    system.work.s_v[s] = shear * by_v + turning[1] * (d_v - e_v * n_v) + (s_more - s_less)
+    return ti.math.vec2(e_u, e_v)
+
+
+@func
+def stretch(s: ti.i32, system: TriangleSystem, rate: ti.f32):
+    """Add the forces by e_u and e_v to those in `work`."""
+    tension = tension_of(s, system.cells, system.mesh, system.mesh.strain, system.mesh.mean)
+    tension *= stiffer(s, system.cells, rate)
+    system.work.s_u[s] = system.work.s_u[s] + tension[0] * system.frames.n_u[s]
+    system.work.s_v[s] = system.work.s_v[s] + tension[1] * system.frames.n_v[s]
+
+
+@func
+def change_of(coefficients: Floats, cells: CellArrays, vectors: Vectors, s: ti.i32) -> ti.math.vec3:
+    """sum_a c_a of vectors at the corners."""
+    total = ti.math.vec3(0.0)
+    for a in ti.static(range(TRIANGLE)):
+        total += coefficients[TRIANGLE * s + a] * vectors[cells.nodes[TRIANGLE * s + a]]
+    return total
+
+
+@func
+def gathered(k: ti.i32, system: TriangleSystem) -> ti.math.vec3:
+    """Sum over the corners at a node of what the triangles' two forces are there [N]."""
+    total = ti.math.vec3(0.0)
+    for at in range(system.mesh.start[k], system.mesh.start[k + 1]):
+        corner = system.mesh.corner[at]
+        s = corner // TRIANGLE
+        total += system.cells.along[corner] * system.work.s_u[s] + system.cells.across[corner] * system.work.s_v[s]
+    return total
+
+
+@func
+def block(k: ti.i32, system: TriangleSystem, rate: ti.f32):
+    """About the 3 x 3 block of K at a node [N/m]: means have a sixth of the stiffness on equal triangles."""
+    total = ti.Matrix.zero(ti.f32, 3, 3)
+    one = ti.Matrix.identity(ti.f32, 3)
+    for at in range(system.mesh.start[k], system.mesh.start[k + 1]):
+        corner = system.mesh.corner[at]
+        s = corner // TRIANGLE
+        u, v, turning = system.cells.along[corner], system.cells.across[corner], system.frames.turning[s]
+        along, shear = BLOCK_SHARE * system.cells.law[s][0], system.cells.law[s][1]
+        law = stiffer(s, system.cells, rate) * ti.math.vec2(along, shear)
+        n_u, n_v = u * system.frames.n_u[s], v * system.frames.n_v[s]
+        by = u * system.frames.by_u[s] + v * system.frames.by_v[s]
+        more = ROOT_HALF * (u + v) * (system.frames.by_u[s] + system.frames.by_v[s])
+        less = ROOT_HALF * (u - v) * (system.frames.by_v[s] - system.frames.by_u[s])
+        total += (law[0] - turning[0]) * n_u.outer_product(n_u) + (law[0] - turning[1]) * n_v.outer_product(n_v)
+        across = law[0] * system.cells.law[s][2]
+        total += across * (n_u.outer_product(n_v) + n_v.outer_product(n_u)) + law[1] * by.outer_product(by)
+        total -= turning[2] * more.outer_product(more) + turning[3] * less.outer_product(less)
+        round_about = turning[0] * u * u + turning[1] * v * v
+        total += (round_about + turning[2] * (u + v) * (u + v) + turning[3] * (u - v) * (u - v)) * one
+    return total
+
+
+@func
+def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.vec3:
+    """The inverse block of a node times r."""
+    d, o = work.diagonal[i], work.off_diagonal[i]
+    return ti.math.vec3(
+        d.x * r.x + o.z * r.y + o.y * r.z, o.z * r.x + d.y * r.y + o.x * r.z, o.y * r.x + o.x * r.y + d.z * r.z
+    )
+
+
+@kernel
+def linearize(
+    system: TriangleSystem,
+    nodes: Nodes,
+    carry: Vectors,
+    dt: ti.f32,
+    is_short: ti.template(),
+):
+    """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
+
+    Damping adds tau times the rate at which the prediction strains.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(system.count):
+        start_u = derivative(system.cells.along, system.cells, nodes, carry, s, TRIANGLE)
+        start_v = derivative(system.cells.across, system.cells, nodes, carry, s, TRIANGLE)
+        d_u = derivative(system.cells.along, system.cells, nodes, nodes.displacement, s, TRIANGLE)
+        d_v = derivative(system.cells.across, system.cells, nodes, nodes.displacement, s, TRIANGLE)
+        rate = system.cells.law[s][3] / dt
+        length_u, length_v = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
+        n_u, n_v = direction_of(start_u, d_u / length_u), direction_of(start_v, d_v / length_v)
+        d_more, d_less, start_more, start_less = d_u + d_v, d_u - d_v, start_u + start_v, start_u - start_v
+        more = direction_of(start_more, d_more / ti.max(d_more.norm(), TINY_LENGTH))
+        less = direction_of(start_less, d_less / ti.max(d_less.norm(), TINY_LENGTH))
+        by_u, by_v = ROOT_HALF * (more - less), ROOT_HALF * (more + less)
+        system.frames.n_u[s], system.frames.n_v[s], system.frames.by_u[s], system.frames.by_v[s] = n_u, n_v, by_u, by_v
+        moved_u, moved_v = d_u - start_u, d_v - start_v
+        e = ti.math.vec2(length_u - 1.0, length_v - 1.0)
+        system.mesh.strain[s] = e + rate * ti.math.vec2(n_u.dot(moved_u), n_v.dot(moved_v))
+        shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v))
+        shear *= system.cells.law[s][1]
+        system.work.s_u[s], system.work.s_v[s] = shear * by_u, shear * by_v
+        length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
+        system.work.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
+        lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
+        pull = ROOT_HALF * system.cells.law[s][1] * shear_of(start_u, start_v)[0]
+        system.frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        system.mesh.mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.mesh.strain)
+        system.work.start_mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.work.start)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(system.count):
+        tension = tension_of(s, system.cells, system.mesh, system.work.start, system.work.start_mean)
+        system.frames.turning[s] = ti.max(system.frames.turning[s] * ti.math.vec4(tension, 1.0, 1.0), 0.0)
+        stretch(s, system, 0.0)
+        system.work.s_u[s], system.work.s_v[s] = dt * dt * system.work.s_u[s], dt * dt * system.work.s_v[s]
+
+
+@func
+def multiply(system: TriangleSystem, nodes: Nodes, dt: ti.f32, product: Vectors, is_short: ti.template()):
+    """(M + dt² K) z of all nodes that are not held, else 0; for the outermost level of a kernel."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(system.count):
+        system.mesh.strain[s] = strain(s, system, system.work.z, 1.0 / dt)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        system.mesh.mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.mesh.strain)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(system.count):
+        stretch(s, system, 1.0 / dt)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        i = system.mesh.node[k]
+        w_i = nodes.inverse_mass[i]
+        total = ti.math.vec3(0.0)
+        if w_i > 0.0:
+            total = system.work.z[i] / w_i + dt * dt * gathered(k, system)
+        product[i] = total
+
+
+@kernel
+def begin_iteration(
+    system: TriangleSystem,
+    nodes: Nodes,
+    elastic: Vectors,
+    dt: ti.f32,
+    is_first: ti.i32,
+    share: Share,
+    is_short: ti.template(),
+):
+    """Residual at the start, and inverse blocks; in the first solve of a step the start is a multiple of `elastic`, and
+    that is 0 from there on.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        i = system.mesh.node[k]
+        w_i = nodes.inverse_mass[i]
+        e_i, r_i = ti.math.vec3(0.0), ti.math.vec3(0.0)
+        if w_i > 0.0:
+            e_i = elastic[i]
+            r_i = -gathered(k, system)
+            if is_first == 0:
+                r_i -= e_i / w_i
+            mass = 1.0 / w_i * ti.Matrix.identity(ti.f32, 3)
+            inverse = (mass + dt * dt * block(k, system, 1.0 / dt)).inverse()
+            system.work.diagonal[i] = ti.math.vec3(inverse[0, 0], inverse[1, 1], inverse[2, 2])
+            system.work.off_diagonal[i] = ti.math.vec3(inverse[1, 2], inverse[0, 2], inverse[0, 1])
+        system.work.r[i] = r_i
+        system.work.z[i] = ti.select(is_first, e_i, 0.0)
+        elastic[i] = ti.select(is_first, 0.0, e_i)
+    multiply(system, nodes, dt, system.work.q, is_short)
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        work_done, energy = 0.0, 0.0
+        for k in range(share.items):
+            n = lane * share.lane_step + k * share.item_step
+            if n < system.own:
+                i = system.mesh.node[n]
+                work_done += system.work.z[i].dot(system.work.r[i])
+                energy += system.work.z[i].dot(system.work.q[i])
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = work_done, energy
+    reduced_tree(share.tree)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        i = system.mesh.node[k]
+        work_done, energy = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
+        multiple = work_done / ti.max(energy, TINY_ENERGY)
+        if k == 0:
+            system.work.scalars[0] = multiple * work_done
+        system.work.x[i] = multiple * system.work.z[i]
+        r_i = system.work.r[i] - multiple * system.work.q[i]
+        system.work.r[i] = r_i
+        system.work.z[i] = preconditioned(i, system.work, r_i)
+        system.work.p[i], system.work.q[i] = ti.math.vec3(0.0), ti.math.vec3(0.0)
+
+
+@kernel
+def iterate(
+    system: TriangleSystem,
+    nodes: Nodes,
+    dt: ti.f32,
+    first: ti.i32,
+    share: Share,
+    is_short: ti.template(),
+):
+    """`ITERATIONS_AT_ONCE` iterations, from number `first` on: with z = B r, gamma = r.z, delta = z.A z,
+
+    beta = gamma/gamma', alpha = gamma/(delta - beta gamma/alpha'), p = z + beta p, q = A z + beta q,
+    x += alpha p, r -= alpha q.
+    """
+    for step in ti.static(range(ITERATIONS_AT_ONCE)):
+        multiply(system, nodes, dt, system.work.a_z, is_short)
+        if ti.static(not runs_on_gpu()):
+            ti.loop_config(serialize=True)
+        for lane in range(share.tree.lanes):
+            gamma, delta = 0.0, 0.0
+            for k in range(share.items):
+                n = lane * share.lane_step + k * share.item_step
+                if n < system.own:
+                    i = system.mesh.node[n]
+                    gamma += system.work.z[i].dot(system.work.r[i])
+                    delta += system.work.z[i].dot(system.work.a_z[i])
+            share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = gamma, delta
+        reduced_tree(share.tree)
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
+        for k in range(system.own):
+            i = system.mesh.node[k]
+            gamma, delta = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
+            beta, before = 0.0, 1.0
+            if first + step > 0:
+                beta = gamma / ti.max(system.work.scalars[2 * (first + step) - 1], TINY_ENERGY)
+                before = system.work.scalars[2 * (first + step)]
+            alpha = 0.0
+            if before > 0.0:
+                rest = delta - beta * gamma / before
+                alpha = ti.select(rest > 0.0, gamma / rest, 0.0)
+            if k == 0:
+                system.work.scalars[2 * (first + step) + 1], system.work.scalars[2 * (first + step) + 2] = gamma, alpha
+            p_i = system.work.z[i] + beta * system.work.p[i]
+            q_i = system.work.a_z[i] + beta * system.work.q[i]
+            system.work.p[i], system.work.q[i] = p_i, q_i
+            system.work.x[i] = system.work.x[i] + alpha * p_i
+            r_i = system.work.r[i] - alpha * q_i
+            system.work.r[i] = r_i
+            system.work.z[i] = preconditioned(i, system.work, r_i)
+
+
+@kernel
+def decrease(scalars: Floats, first: ti.i32, end: ti.i32) -> ti.math.vec2:
+    """By how much iterations from `first` to before `end` let the energy fall, and by how much all up to there."""
+    last, whole = 0.0, scalars[0]
+    ti.loop_config(serialize=True)
+    for k in range(end):
+        change = scalars[2 * k + 1] * scalars[2 * k + 2]
+        whole += change
+        if k >= first:
+            last += change
+    return ti.math.vec2(last, whole)
+
+
+@func
+def measure_displaced(system: TriangleSystem, nodes: Nodes, is_short: ti.template()):
+    """Strains of triangles, then of nodes, where displacements lead; for the outermost level of a kernel."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for s in range(system.count):
+        d_u = derivative(system.cells.along, system.cells, nodes, nodes.displacement, s, TRIANGLE)
+        d_v = derivative(system.cells.across, system.cells, nodes, nodes.displacement, s, TRIANGLE)
+        system.mesh.strain[s] = ti.math.vec2(d_u.norm() - 1.0, d_v.norm() - 1.0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        system.mesh.mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.mesh.strain)
+
+
+@kernel
+def finish_iteration(
+    system: TriangleSystem,
+    nodes: Nodes,
+    elastic: Vectors,
+    expected: Strains,
+    is_short: ti.template(),
+):
+    """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
+    nodes are expected to have then.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for chunk in range(system.chunks):
+        moment, mass = ti.math.vec3(0.0), 0.0
+        for k in range(system.mesh.chunk[chunk], system.mesh.chunk[chunk + 1]):
+            i = system.mesh.node[k]
+            w_i = nodes.inverse_mass[i]
+            m_i = HELD
+            if w_i > 0.0:
+                m_i = 1.0 / w_i
+            moment += m_i * system.work.x[i]
+            mass += m_i
+        system.work.moment[chunk] = ti.math.vec4(moment, mass)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for piece in range(system.pieces):
+        total = ti.math.vec4(0.0)
+        for chunk in range(system.mesh.first_chunk[piece], system.mesh.first_chunk[piece + 1]):
+            total += system.work.moment[chunk]
+        system.work.shift[piece] = ti.select(total[3] < HELD, total.xyz / total[3], 0.0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        i = system.mesh.node[k]
+        if nodes.inverse_mass[i] > 0.0:
+            x_i = system.work.x[i] - system.work.shift[system.mesh.piece[k]]
+            elastic[i] = elastic[i] + x_i
+            nodes.displacement[i] = nodes.displacement[i] + x_i
+    measure_displaced(system, nodes, is_short)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for k in range(system.own):
+        expected[system.mesh.node[k]] = system.mesh.mean[system.mesh.node[k]]
+
+
+@kernel
+def measure_node_excess(
+    system: TriangleSystem,
+    nodes: Nodes,
+    expected: Strains,
+    share: Share,
+    is_short: ti.template(),
+) -> Results:
+    """Largest excess of strain of nodes of triangles, as `spring_convergence` has it, and how many along warp and weft
+    are beyond `LARGEST_RESIDUAL`.
+    """
+    measure_displaced(system, nodes, is_short)
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        largest, unconverged = 0.0, 0.0
+        for k in range(share.items):
+            n = lane * share.lane_step + k * share.item_step
+            if n < system.own:
+                excess = system.mesh.mean[system.mesh.node[n]] - expected[system.mesh.node[n]]
+                largest = ti.max(largest, excess.x, excess.y)
+                for axis in ti.static(range(2)):
+                    if excess[axis] > LARGEST_RESIDUAL:
+                        unconverged += 1.0
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
+    return reduced_tree(share.tree)
