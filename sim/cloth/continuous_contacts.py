@@ -12,7 +12,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import NodeSums, PatchMotion, PushedNodes
-from sim.cloth.continuous_response import STEPS, begin_push, push_on
+from sim.cloth.continuous_response import FIRST_OF_ROUND, FIRST_OF_SUBSTEP, STEPS, begin_push, push_on
 from sim.cloth.continuous_zones import ImpactZones
 from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
@@ -228,10 +228,12 @@ class ContinuousContacts:
         if not self._is_warm:
             self._warm_up(state)
             self._is_warm = True
+        first = FIRST_OF_SUBSTEP
         while True:
             found = self._find(state, dt)
             if found:
-                self._push(state, found, is_first=True, relax=relax)
+                self._push(state, found, first=first, relax=relax)
+                first = FIRST_OF_ROUND
             left, is_beyond, not_finite = self._keep_apart(state, found)
             if not_finite:
                 return  # as above
@@ -247,7 +249,7 @@ class ContinuousContacts:
     def _warm_up(self, state: ClothState) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
         for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
-            self._begin_push(state, 0, is_first=True, short=short)
+            self._begin_push(state, 0, first=FIRST_OF_SUBSTEP, short=short)
             self._push_on(0, 0, 0, short=short)
         if self._meets_cloth:
             self._pairs.warm_up()
@@ -262,22 +264,22 @@ class ContinuousContacts:
                 return found
 
     def _push(
-        self, state: ClothState, count: int, *, is_first: bool, relax: Callable[[], bool] = lambda: False
+        self, state: ClothState, count: int, *, first: int = 0, relax: Callable[[], bool] = lambda: False
     ) -> None:
         """Push; first in turns with the springs, for as long as these `relax`."""
         short = self._is_short(count)
         while True:
-            pushing, touched, is_missing = self._begin_push(state, count, is_first=is_first, short=short)
+            pushing, touched, is_missing = self._begin_push(state, count, first=first, short=short)
             self._iterations += STEPS if pushing else 0
             if not pushing or not relax():
                 break
-            is_first = False
+            first = 0
         if pushing and is_missing:
-            for first in range(0, MORE_ITERATIONS, STEPS):
-                self._push_on(pushing, touched, first, short=short)
+            for step in range(0, MORE_ITERATIONS, STEPS):
+                self._push_on(pushing, touched, step, short=short)
             self._iterations += MORE_ITERATIONS
 
-    def _begin_push(self, state: ClothState, count: int, *, is_first: bool, short: bool) -> list[int]:
+    def _begin_push(self, state: ClothState, count: int, *, first: int, short: bool) -> list[int]:
         """A round of the first `STEPS` steps; what `begin_push` returns."""
         contacts = self._contacts
         found: list[int] = begin_push(
@@ -290,7 +292,7 @@ class ContinuousContacts:
             self._sums,
             state.thickness,
             self.rigid.bodies.pushed,
-            int(is_first),
+            first,
             short,
         )
         return found
@@ -318,7 +320,7 @@ class ContinuousContacts:
             if not found[0]:
                 return found
             self._repaired += found[0]
-            self._push(state, count, is_first=False)
+            self._push(state, count)
         found = self._finish(state, count)
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts

@@ -47,6 +47,9 @@ LEAST_GAP = 0.02
 KEPT_BY_REPAIR = 0.3
 """Share of its separation that a pair keeps which would have crossed: above 1 - `LARGEST_SHARE`."""
 
+FIRST_OF_ROUND, FIRST_OF_SUBSTEP = 1, 2
+"""Pushes that forget the impulses of what was found before; and that note what displacements are without contacts."""
+
 STEPS = 8
 """Steps of the iteration in one launch: what all iterations have at least."""
 
@@ -104,7 +107,7 @@ def weigh_contacts(
     for i in range(all_end):
         if i < vertex_count:
             sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
-            if is_first == 1:
+            if is_first == FIRST_OF_SUBSTEP:
                 sums.predicted[i] = nodes.displacement[i]
             if bodies.may_move == 1:
                 sums.lever[i], sums.pressing_body[i] = 0.0, -1
@@ -154,7 +157,7 @@ def weigh_contacts(
         ti.loop_config(serialize=True)
     for place in range(pushing_end):
         c = impulses.pushing[place]
-        if is_first == 1:
+        if is_first > 0:
             impulses.impulse[c] = ti.math.vec3(0.0)
         if bodies.may_move == 1 and (contacts.kind[c] >= 0 or contacts.kind[c] == WALL):
             contacts.normal[c] = turned_to_support(c, contacts, nodes.support)
