@@ -313,7 +313,7 @@ def push_apart(
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, touched_end, bodies_end = count, touched_count, bodies.count
-    moved_end = touched_count + bodies.count * ti.static(int(runs_on_gpu()))
+    moved_end = touched_count + bodies.count
     new_end = starts * ti.max(count, touched_count, bodies.count)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -343,12 +343,15 @@ def push_apart(
         for step in ti.static(range(STEPS)):
             for place in range(contacts_end):
                 push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
-            for place in range(moved_end):
-                if place < touched_end:
+            if ti.static(runs_on_gpu()):
+                for place in range(moved_end):
+                    if place < touched_end:
+                        move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
+                    else:
+                        move_body(place - touched_end, momenta[step + 1], impulses, bodies)
+            else:
+                for place in range(touched_end):
                     move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
-                elif ti.static(runs_on_gpu()):
-                    move_body(place - touched_end, momenta[step + 1], impulses, bodies)
-            if ti.static(not runs_on_gpu()):
                 ti.loop_config(serialize=True)
                 for b in range(bodies_end):
                     move_body(b, momenta[step + 1], impulses, bodies)

@@ -12,7 +12,7 @@ from sim.cloth.row_blocks import LANES, Blocks
 from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
+from sim.core.reductions import Share, device_lanes, runs_on_gpu
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -41,12 +41,13 @@ def excess_of(
 @kernel
 def measure_excess(
     springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, share: Share
-) -> Results:
+) -> ti.math.vec2:
     """Largest excess of springs of threads in lists, and how many have not converged."""
+    highest, total = 0, 0
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
-        largest, unconverged = 0.0, 0.0
+    for lane in range(ti.static(device_lanes().count)):
+        largest, unconverged = 0.0, 0
         for k in range(share.items):
             s = lane * share.lane_step + k * share.item_step
             if s < count:
@@ -56,9 +57,10 @@ def measure_excess(
                 )
                 largest = ti.max(largest, excess)
                 if excess > LARGEST_RESIDUAL:
-                    unconverged += 1.0
-        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
-    return reduced_tree(share.tree)
+                    unconverged += 1
+        ti.atomic_max(highest, ti.bit_cast(largest, ti.i32))  # bits of numbers from 0 on are in their order
+        ti.atomic_add(total, unconverged)
+    return ti.math.vec2(ti.bit_cast(highest, ti.f32), ti.cast(total, ti.f32))
 
 
 @kernel
