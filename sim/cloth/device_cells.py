@@ -32,7 +32,7 @@ class DeviceCells:
         mesh: nodes of triangles; nothing of rectangles.
         own, chunks, pieces: how many nodes, chunks and pieces those are.
         cell_of_colour: first cell of each colour, and number of cells, (colours + 1,).
-        multiplier: of the shear of rectangles, or what triangles expect as |d_u| and |d_v|, (count * STRAINS,).
+        multiplier: of each strain, of which rectangles have the shear alone, (count * STRAINS,).
     """
 
     def __init__(self, cells: Cells, cloth_of: NDArray[np.int32]) -> None:
@@ -41,7 +41,7 @@ class DeviceCells:
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
         self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
-        self.multiplier = ti.ndarray(ti.f32, self.count * STRAINS)
+        self.multiplier = ti.ndarray(ti.f32, self.count * STRAINS if cells.arity != TRIANGLE else 1)
         nodes, along, across = (ti.ndarray(kind, self.count * self.arity) for kind in (ti.i32, ti.f32, ti.f32))
         nodes.from_numpy(np.ascontiguousarray(cells.nodes).ravel())
         along.from_numpy(cells.along.astype(np.float32).ravel())
