@@ -25,8 +25,8 @@ PAIR, BEND_OF_GRID = 2, 3
 
 
 class XPBDSprings:
-    """Gauss-Seidel over the springs, colour by colour, each an implicit Euler step of that spring alone; over threads of
-    rectangles, each as a whole (`threads`); and the triangles of all meshes together (`triangles`).
+    """Gauss-Seidel over the springs, colour by colour, each an implicit Euler step of that spring alone; over whole
+    threads of rectangles (`threads`); and the triangles of all meshes together (`triangles`).
 
     Nodes that a spring moves in a colour belong to no other spring of it, so the result is the same whatever the number
     of threads. Momentum of free cloth is kept to rounding. Springs push along their predicted direction rather than
