@@ -45,7 +45,7 @@ class DeviceCells:
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
         self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
-        self.multiplier = ti.ndarray(ti.f32, self.count)
+        self.multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
         nodes, along, across = (ti.ndarray(kind, self.count * self.arity) for kind in (ti.i32, ti.f32, ti.f32))
         nodes.from_numpy(np.ascontiguousarray(cells.nodes).ravel())
         along.from_numpy(cells.along.astype(np.float32).ravel())

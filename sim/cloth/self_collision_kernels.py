@@ -45,6 +45,9 @@ def lanes_of_pair() -> int:
 BLOCK = 16
 """Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""
 
+ALONG_NORMAL = 0.5
+"""Cosine of the angle between the shortest way of two elements and what is across both from which on that is meant."""
+
 FAR = 1.0e9
 """Coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32."""
 
@@ -306,13 +309,16 @@ def look_at_pair(
     zero = ti.math.vec3(0.0)
     weight = ti.math.vec4(0.0)
     part = 1.0
+    is_inside = True
     if ti.static(are_edges):
         shares = closest_on_edges(zero, x1, x2, x3)
+        is_inside = ti.min(shares, 1.0 - shares).min() > 0.0
         weight = ti.math.vec4(1.0 - shares[0], shares[0], shares[1] - 1.0, -shares[1])
         # What is nearest at an end of an edge is a vertex, which is near to a triangle too.
         part = ti.select(ti.min(shares, 1.0 - shares).min() > END_OF_EDGE, OF_EDGES, 0.0)
     else:
         shares = closest_on_triangle(zero, x1, x2, x3)
+        is_inside = shares.min() > 0.0
         weight = ti.math.vec4(1.0, -shares[0], -shares[1], -shares[2])
     apart = weight[1] * x1 + weight[2] * x2 + weight[3] * x3
     distance = apart.norm()
@@ -328,6 +334,9 @@ def look_at_pair(
         if distance < ti.max(keeps, ti.min(2.0 * motion, approach) + allowed):
             across = x1.cross(x3 - x2) if ti.static(are_edges) else (x2 - x1).cross(x3 - x1)
             n = unit_or(apart, across)
+            # At a millionth of an element, rounding turns `apart` by so much that no plane across it is between both.
+            if is_inside and ti.abs(across.dot(n)) > ALONG_NORMAL * across.norm():
+                n = ti.math.sign(across.dot(n)) * unit_or(across, n)
             least = least_displacement(distance, keeps, recovery)
             slot = ti.atomic_add(contacts.counter[0], 1)
             if slot < contacts.capacity:

@@ -1,4 +1,6 @@
-"""Compliant springs with small steps: XPBD with one iteration a step (Macklin et al. 2019, "Small steps")."""
+"""Compliant springs with small steps: XPBD with one iteration a step (Macklin et al. 2019, "Small steps"), threads of
+rectangles and triangles of meshes as many at once.
+"""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -26,7 +28,8 @@ PAIR, BEND_OF_GRID = 2, 3
 
 
 class XPBDSprings:
-    """Gauss-Seidel over the springs, colour by colour, each an implicit Euler step of that spring alone.
+    """Gauss-Seidel over the springs, colour by colour, each an implicit Euler step of that spring alone; over whole
+    threads of rectangles (`threads`); and the triangles of all meshes together (`triangles`).
 
     Nodes that a spring moves in a colour belong to no other spring of it, so the result is the same whatever the number
     of threads. Momentum of free cloth is kept to rounding. Springs push along their predicted direction rather than
@@ -35,8 +38,8 @@ class XPBDSprings:
 
     Approximate: one sweep a step does not let a stiff spring know of all that hangs on it. A spring alone, of a colour
     that comes early, stretches by 2 n g dt² more than it should if n nodes hang on it, whatever its stiffness; those of
-    a thread by nothing. That falls with the square of the step, and with every further sweep. Bend springs have one
-    sweep always.
+    a thread, and triangles, by nothing. That falls with the square of the step, and with every further sweep. Bend
+    springs have one sweep always.
 
     Args:
         state: what they move.
@@ -68,7 +71,7 @@ class XPBDSprings:
             triangles.take_parameters()
 
     def excess(self, dt: float) -> NDArray[np.float64]:
-        """By how much a spring of threads and edges is longer than its tension makes it, at most [rest lengths].
+        """By how much threads, or meshes at a node, are longer than tension makes them, at most [rest lengths].
 
         Of each cloth; those that are solved in the same lists have the same.
         """
@@ -82,7 +85,7 @@ class XPBDSprings:
         return largest
 
     def diagnostics(self) -> Mapping[str, float]:
-        """`overlong_springs`: at the end of the frame, along the threads of rectangles and the edges of meshes."""
+        """`overlong_springs`: at the end of the frame, along the threads of rectangles, and at the nodes of meshes."""
         return {"overlong_springs": float(self._unconverged)}
 
     def stable_dt(self, cloths: NDArray[np.bool_] | None = None) -> float:  # noqa: ARG002  (the integrators' protocol)
