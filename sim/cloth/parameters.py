@@ -231,10 +231,9 @@ class ClothParameters(Parameters):
         description="Sweeps of xpbd over its springs in every step, before contacts [-]; if omitted 1 where substeps "
         f"are given, else as many as it takes for no spring to be longer than its tension makes it, up to "
         f"{MOST_SWEEPS}; springs and contacts then take up to {MOST_TURNS} turns more where these leave any too long. "
-        "A sweep does not "
-        "let every spring know of all that hangs on it: cloth that hangs from single points, and any mesh, stretches "
-        "too much there, by less with each sweep and with the square of the step; a run warns of springs that get half "
-        "too long by it. Of each cloth its own.",
+        "A sweep does not let every spring of a rectangle know of all that hangs on it: one that hangs from single "
+        "points stretches too much there, by less with each sweep and with the square of the step; a run warns of "
+        "springs that get half too long by it. Each cloth has its own.",
     )
 
     @model_validator(mode="before")
