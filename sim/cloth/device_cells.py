@@ -19,7 +19,7 @@ from sim.core.launch import kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 
 SHEAR_SWEEPS = 3
-"""Sweeps over the cells of rectangles before the threads: with `over_relaxed` ones shear has its stiffness within a few
+"""Sweeps over the cells of rectangles before threads are first solved: with `over_relaxed` ones shear has its stiffness within a few
 per cent where a cell is up to twice as stiff as the inertia of its nodes, and within 40 % up to nine times."""
 
 

@@ -89,7 +89,7 @@ class RectangleSprings:
                 short,
             )
         for sweep in range(sweeps):
-            for time, parity in product(range(SHEAR_SWEEPS), range(2)):
+            for time, parity in product(range(SHEAR_SWEEPS if sweep == 0 else 1), range(2)):
                 solve_cells_in_rows(
                     blocks,
                     parity,

@@ -148,7 +148,7 @@ class XPBDSprings:
         for cells in solved:
             if not cloths[list(cells.cloths)].any():
                 continue
-            for time, colour in product(range(SHEAR_SWEEPS), cells.first_colours):
+            for time, colour in product(range(SHEAR_SWEEPS if is_first else 1), cells.first_colours):
                 solve_shears(
                     cells.on_device,
                     cells.cell_of_colour,
