@@ -19,8 +19,9 @@ from sim.core.launch import kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 
 SHEAR_SWEEPS = 3
-"""Sweeps over the cells of rectangles before threads are first solved: with `over_relaxed` ones shear has its stiffness within a few
-per cent where a cell is up to twice as stiff as the inertia of its nodes, and within 40 % up to nine times."""
+"""Sweeps over the cells of rectangles before threads are first solved in a step: with `over_relaxed` ones shear has its
+stiffness within a few per cent where a cell is up to twice as stiff as the inertia of its nodes, and within 40 % up to
+nine times."""
 
 
 class DeviceCells:
