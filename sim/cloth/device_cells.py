@@ -143,12 +143,12 @@ def velocity_derivative(coefficients: Floats, cells: CellArrays, motion: NodeMot
 
 
 @func
-def weights(cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()) -> ti.math.vec3:
+def weights(cells: CellArrays, nodes: Nodes, s: ti.i32) -> ti.math.vec3:
     """sum_a w_a c_a c'_a: of d_u with itself, of d_v with itself, of both [1/(kg m²)]."""
     total = ti.math.vec3(0.0)
-    for a in ti.static(range(arity)):
-        w_a = nodes.inverse_mass[cells.nodes[arity * s + a]]
-        u, v = cells.along[arity * s + a], cells.across[arity * s + a]
+    for a in ti.static(range(RECTANGLE)):
+        w_a = nodes.inverse_mass[cells.nodes[RECTANGLE * s + a]]
+        u, v = cells.along[RECTANGLE * s + a], cells.across[RECTANGLE * s + a]
         total += w_a * ti.math.vec3(u * u, v * v, u * v)
     return total
 
@@ -187,12 +187,11 @@ def push_nodes(
     p_u: ti.math.vec3,
     p_v: ti.math.vec3,
     changed: Vectors,
-    arity: ti.template(),
 ):
     """Give the nodes of a cell what pushes along d_u and d_v change of displacements or velocities."""
-    for a in ti.static(range(arity)):
-        i = cells.nodes[arity * s + a]
-        push = cells.along[arity * s + a] * p_u + cells.across[arity * s + a] * p_v
+    for a in ti.static(range(RECTANGLE)):
+        i = cells.nodes[RECTANGLE * s + a]
+        push = cells.along[RECTANGLE * s + a] * p_u + cells.across[RECTANGLE * s + a] * p_v
         changed[i] = changed[i] + nodes.inverse_mass[i] * push
 
 
@@ -203,11 +202,11 @@ def solve_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, 
     d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE)
     shear, by_u, by_v = shear_of(d_u, d_v)
     strength = cells.law[s][1] * dt_squared
-    stiffness = strength * weight_along(by_u, by_v, weights(cells, nodes, s, RECTANGLE))
+    stiffness = strength * weight_along(by_u, by_v, weights(cells, nodes, s))
     before = ti.select(is_first, 0.0, multiplier[s])
     change = -over_relaxed(stiffness) * (strength * shear + before) / (stiffness + 1.0)
     multiplier[s] = before + change
-    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.displacement, RECTANGLE)
+    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.displacement)
 
 
 @kernel
@@ -229,36 +228,35 @@ def solve_shears(
 
 
 @func
-def damp_cell(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, arity: ti.template()):
+def damp_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32):
     """Implicit Euler of the force -tau k de/dt of the shear."""
-    d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
-    d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
-    w = weights(cells, nodes, s, arity)
+    d_u = derivative(cells.along, cells, nodes, motion.carry, s, RECTANGLE)
+    d_v = derivative(cells.across, cells, nodes, motion.carry, s, RECTANGLE)
+    w = weights(cells, nodes, s)
     law = cells.law[s]
-    rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
-    rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
+    rate_u = velocity_derivative(cells.along, cells, motion, s, RECTANGLE)
+    rate_v = velocity_derivative(cells.across, cells, motion, s, RECTANGLE)
     _, by_u, by_v = shear_of(d_u, d_v)
     strength, weight = law[1] * law[3] * dt, weight_along(by_u, by_v, w)
     change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v)) / (strength * weight + 1.0)
-    push_nodes(s, cells, nodes, change * by_u, change * by_v, motion.velocity, arity)
+    push_nodes(s, cells, nodes, change * by_u, change * by_v, motion.velocity)
 
 
 @kernel
-def damp_cells(
+def damp_shears(
     cells: CellArrays,
     cell_of_colour: Integers,
     colour: ti.i32,
     nodes: Nodes,
     motion: NodeMotion,
     dt: ti.f32,
-    arity: ti.template(),
 ):
     """The cells of some colours, one colour after the other."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     s0, s1, s2, s3, s4 = colour_bounds(cell_of_colour, colour)
     for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
         for s in range(start, stop):
-            damp_cell(s, cells, nodes, motion, dt, arity)
+            damp_shear(s, cells, nodes, motion, dt)
 
 
 @func

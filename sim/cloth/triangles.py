@@ -299,6 +299,23 @@ def multiply(system: TriangleSystem, nodes: Nodes, dt: ti.f32, product: Vectors,
         product[i] = total
 
 
+@func
+def sum_products(system: TriangleSystem, product: Vectors, share: Share):
+    """z.r and z.A z, for the `product` A z; for the outermost level of a kernel."""
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        of_rest, of_product = 0.0, 0.0
+        for k in range(share.items):
+            n = lane * share.lane_step + k * share.item_step
+            if n < system.own:
+                i = system.mesh.node[n]
+                of_rest += system.work.z[i].dot(system.work.r[i])
+                of_product += system.work.z[i].dot(product[i])
+        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = of_rest, of_product
+    reduced_tree(share.tree)
+
+
 @kernel
 def begin_iteration(
     system: TriangleSystem,
@@ -331,18 +348,7 @@ def begin_iteration(
         system.work.z[i] = ti.select(is_first, e_i, 0.0)
         elastic[i] = ti.select(is_first, 0.0, e_i)
     multiply(system, nodes, dt, system.work.q, is_short)
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
-        work_done, energy = 0.0, 0.0
-        for k in range(share.items):
-            n = lane * share.lane_step + k * share.item_step
-            if n < system.own:
-                i = system.mesh.node[n]
-                work_done += system.work.z[i].dot(system.work.r[i])
-                energy += system.work.z[i].dot(system.work.q[i])
-        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = work_done, energy
-    reduced_tree(share.tree)
+    sum_products(system, system.work.q, share)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
@@ -374,18 +380,7 @@ def iterate(
     """
     for step in ti.static(range(ITERATIONS_AT_ONCE)):
         multiply(system, nodes, dt, system.work.a_z, is_short)
-        if ti.static(not runs_on_gpu()):
-            ti.loop_config(serialize=True)
-        for lane in range(share.tree.lanes):
-            gamma, delta = 0.0, 0.0
-            for k in range(share.items):
-                n = lane * share.lane_step + k * share.item_step
-                if n < system.own:
-                    i = system.mesh.node[n]
-                    gamma += system.work.z[i].dot(system.work.r[i])
-                    delta += system.work.z[i].dot(system.work.a_z[i])
-            share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = gamma, delta
-        reduced_tree(share.tree)
+        sum_products(system, system.work.a_z, share)
         if ti.static(is_short):
             ti.loop_config(serialize=True)
         for k in range(system.own):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim.cloth.angular_momentum import AngularMomentumCorrection
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
-from sim.cloth.device_cells import SHEAR_SWEEPS, DeviceCells, damp_cells, solve_shears
+from sim.cloth.device_cells import SHEAR_SWEEPS, DeviceCells, damp_shears, solve_shears
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
@@ -117,9 +117,7 @@ class XPBDSprings:
         for cells in self._cells:
             if cells.arity != TRIANGLE and cells.is_damped:
                 for colour in cells.first_colours:
-                    damp_cells(
-                        cells.on_device, cells.cell_of_colour, colour, state.nodes, state.motion, dt, cells.arity
-                    )
+                    damp_shears(cells.on_device, cells.cell_of_colour, colour, state.nodes, state.motion, dt)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
