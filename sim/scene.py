@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
-from sim.core.parameters import Device, Parameters, Vector3
+from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3
 from sim.fluid.parameters import FluidParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
@@ -36,21 +36,24 @@ class SceneParameters(Parameters):
         sticky = [fluid.name for fluid in self.fluid if fluid.adhesion > 0.0]
         free = [body.name for body in self.rigid if body.kind == "dynamic"]
         if sticky and free:
-            raise ValueError(
-                f'adhesion of "{sticky[0]}" has no reaction on bodies in this version, and would drive "{free[0]}" by '
-                'itself; set adhesion = 0, or make the bodies "static" or "kinematic"'
+            index = next(number for number, fluid in enumerate(self.fluid) if fluid.name == sticky[0])
+            raise KeyRefusedError(
+                ("fluid", index, "adhesion"),
+                f'of "{sticky[0]}" has no reaction on bodies in this version, and would drive "{free[0]}" by '
+                'itself; set adhesion = 0, or make the bodies "static" or "kinematic"',
             )
         return self
 
     @model_validator(mode="after")
     def _has_one_air(self) -> Self:
         if self.smoke and (conflict := conflict_in_one_air(self.cloth)):
-            raise ValueError(conflict)
+            raise KeyRefusedError(*conflict)
         for number, smoke in enumerate(self.smoke):
             for other in self.smoke[:number]:
                 if self.cloth and boxes_overlap(smoke.corners(self.domain), other.corners(self.domain)):
-                    raise ValueError(
-                        f'the boxes of smoke "{other.name}" and "{smoke.name}" overlap, and cloth can only be in one '
-                        "air; give them min and max"
+                    raise KeyRefusedError(
+                        ("smoke", number),
+                        f'its box and that of "{other.name}" overlap, and cloth can only be in one air; '
+                        "give them min and max",
                     )
         return self

@@ -4,7 +4,7 @@ The solvers name their diagnostics (`sim.core.solver.Diagnostics`); a name that 
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 SHARE = "%"  # unit of numbers that are stored as fractions of 1 and shown in per cent
 
@@ -142,6 +142,8 @@ class CountedEvent:
     many: str  # what has happened several times
     and_so: str = ""  # what follows either
     running_total: bool = False  # counted since the start; else in every frame by itself
+    # what it means for the film and what helps, by kind of body
+    means: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def text(self, count: int) -> str:
         """Count in words: `3 solves hit their iteration limit`."""
@@ -149,8 +151,28 @@ class CountedEvent:
 
 
 WARNINGS = (
-    CountedEvent("not_converged", "solve hit its iteration limit", "solves hit their iteration limit"),
-    CountedEvent("squeezed", "frame has", "frames have", " particles squeezed by more than 20 %"),
+    CountedEvent(
+        "not_converged",
+        "solve hit its iteration limit",
+        "solves hit their iteration limit",
+        means={
+            "fluid": "it is denser there than density_tolerance asks, which shows as lost volume if it goes on; give "
+            "more max_iterations or a smaller cfl",
+            "smoke": "some air appears or vanishes, which hardly shows; give more projection_max_iterations",
+            "rigid": "bodies in contact may sink into each other or tremble; give fewer that touch, or masses less far "
+            "apart",
+        },
+    ),
+    CountedEvent(
+        "squeezed",
+        "frame has",
+        "frames have",
+        " particles squeezed by more than 20 %",
+        means={
+            "fluid": "where bodies or walls press fluid together, it bursts out a frame later; leave it a way out, or "
+            "give a smaller particle_radius or cfl",
+        },
+    ),
     CountedEvent(
         "emission_blocked",
         "particle was not emitted, as its place was taken",

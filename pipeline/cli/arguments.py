@@ -98,6 +98,22 @@ def target_option(meaning: str, *, required: bool = False) -> Callable[[Any], An
     return click.option("-o", "--to", "target", type=path, required=required, help=f"Where to write it{meaning}.")
 
 
+def read_own_job(job_file: Path, overrides: Sequence[str], *, preview: bool, until: Sequence[str] = ()) -> LoadedJob:
+    """A job file that names no program but the user's own.
+
+    Raises JobFileError with every problem; if keys or values are wrong, with those of the scene that is left, too.
+    """
+    from pipeline.job.loading import InvalidJobError, read_job
+    from pipeline.run.checked_job import with_findings
+
+    try:
+        loaded = read_job(job_file, overrides, preview=preview)
+    except InvalidJobError as error:
+        raise with_findings(error, until) from None
+    require_own_programs(loaded, overrides)
+    return loaded
+
+
 def require_own_programs(loaded: LoadedJob, overrides: Sequence[str]) -> None:
     """Refuse (JobFileError) a job file that names a program to be run: whose file it is does not decide what runs here.
 

@@ -21,7 +21,7 @@ from pipeline.cli.arguments import (
     parse_frames,
     place,
     queue_options,
-    require_own_programs,
+    read_own_job,
     require_plannable,
     submission_folder,
     submitted_job_argument,
@@ -63,11 +63,11 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
     pipeline check my-film
     pipeline check dam.toml --set fluid.water.particle_radius=0.005
     """
-    from pipeline.job.loading import read_job
     from pipeline.kinds.table import KINDS
+    from pipeline.model.problems import format_path
     from pipeline.run.checked_job import load_checked_job, needs_pictures
 
-    require_own_programs(read_job(job_file, overrides, preview=preview), overrides)
+    read_own_job(job_file, overrides, preview=preview, until=until)
     loaded, findings = load_checked_job(job_file, overrides, preview=preview, until=until)
     print_warnings(loaded.warnings)
     if as_json:
@@ -79,6 +79,8 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
     for kind in KINDS.values():
         if kind.size and kind.bodies(job):
             click.echo(f"  {kind.size.format(findings.elements[kind.name])}")
+    for fact in findings.facts:
+        click.echo(f"  {format_path(fact.path)} {fact.message}")
     if needs_pictures(until):
         width, height = job.render.resolution
         click.echo(f"  {width} x {height} pixels, {job.render.quality} quality")
@@ -101,12 +103,11 @@ def plan(
     pipeline plan my-film --until surface
     pipeline plan dam.toml --set 'camera.position=[0, -3, 1]'
     """
-    from pipeline.job.loading import read_job
     from pipeline.run.assessment import assess_job
     from pipeline.run.checked_job import load_checked_job
     from pipeline.run.plan import Verdict, estimate, summarize
 
-    require_own_programs(read_job(job_file, overrides, preview=preview), overrides)
+    read_own_job(job_file, overrides, preview=preview, until=until)
     loaded, _ = load_checked_job(job_file, overrides, preview=preview, until=until)
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     assessments, estimates, _ = assess_job(loaded.job, layout, until)
@@ -154,13 +155,11 @@ def submit(
     pipeline submit dam.toml --detach --priority 10
     pipeline submit dam.toml --output /shared/renders --scheduler tcp://farm:8786
     """
-    from pipeline.job.loading import read_job
     from pipeline.record.interrupted_recording import complete_interrupted_recording
 
     if job_file.name == "job.toml" and (sentence := complete_interrupted_recording(JobLayout(job_file.parent))):
         click.echo(sentence, err=True)
-    loaded = read_job(job_file, overrides, preview=preview)
-    require_own_programs(loaded, overrides)
+    loaded = read_own_job(job_file, overrides, preview=preview, until=until)
     require_plannable(loaded)
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     state = look_at(loaded.job, layout, until)
@@ -271,8 +270,8 @@ def openjd(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
     from pipeline.show.openjd import job_template
     from pipeline.stages import STAGES
 
+    read_own_job(job_file, overrides, preview=preview)
     loaded, _ = load_checked_job(job_file, overrides, preview=preview)
-    require_own_programs(loaded, overrides)
     require_named_devices(loaded.job, [stage.name for stage in STAGES])
     print_warnings(loaded.warnings)
     layout = JobLayout((output / loaded.job.name).absolute())

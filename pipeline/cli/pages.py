@@ -16,7 +16,7 @@ from pipeline.cli.arguments import (
     job_options,
     output_option,
     parse_size,
-    require_own_programs,
+    read_own_job,
     submitted_job_argument,
 )
 
@@ -111,7 +111,6 @@ def live(
     pipeline live dam.toml --preview --port 0
     """
     from pipeline.base.resources import machine_capacity
-    from pipeline.job.loading import read_job
     from pipeline.run.checked_job import load_checked_job
     from pipeline.web.live.admission import computing_power, fluent, live_job, require_small, told_changes
     from pipeline.web.live.parameters import parameters_of
@@ -121,8 +120,7 @@ def live(
     if as_written and substeps is not None:
         raise click.UsageError("--as-written keeps the job's substeps, and --substeps changes them; give one of them")
     require_pages()
-    loaded = read_job(job_file, overrides, preview=preview)
-    require_own_programs(loaded, overrides)
+    loaded = read_own_job(job_file, overrides, preview=preview)
     job = live_job(loaded.job, substeps=substeps)
     loaded, findings = load_checked_job(job_file, overrides, preview=preview)
     threads, on_gpu = cores or machine_capacity().cores, resolve_device(job.device) != "cpu"

@@ -9,15 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from pipeline.base.errors import JobFileError
 from pipeline.base.layout import JobLayout
 from pipeline.job.input_files import InputFile, input_files
-from pipeline.job.messages import explain
 from pipeline.job.overrides import Override, OverrideError, apply_overrides, parse_override
 from pipeline.job.presets import preview_overrides
-from pipeline.kinds.table import job_type
+from pipeline.job.standing import StandingPart
 from pipeline.model.job import Job
 from pipeline.model.meshes import with_value
 from pipeline.model.problems import JobSource
@@ -47,6 +44,22 @@ class LoadedJob:
     path: Path  # the file it was read from
     source: JobSource  # turns a problem into a line with its place
     warnings: tuple[str, ...] = ()  # what is worth a look, one line each
+
+
+class InvalidJobError(JobFileError):
+    """A job file whose keys or values are wrong; what stands of it can be looked at as a scene."""
+
+    def __init__(self, lines: list[str], standing: StandingPart, source: JobSource, path: Path) -> None:
+        super().__init__(lines)
+        self.args = (lines, standing, source, path)
+        self.standing, self.source, self.path = standing, source, path
+
+    def standing_job(self) -> Job | None:
+        """The part of the job that stands, its files absolute; None if nothing does."""
+        job = self.standing.job
+        for change in [] if job is None else _absolute_files(job, self.path):
+            job = with_value(job, change.path, change.value)
+        return job
 
 
 def load_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False) -> Job:
@@ -198,7 +211,10 @@ _JOBS: dict[str, Job] = {}
 def _job_of(path: Path, text: str, source: JobSource) -> Job:
     """The job that a text describes, its files as the text names them; each text is validated once a process."""
     if text not in _JOBS:
-        _remember(text, _validate(_parse(path, text), source))
+        standing = StandingPart(_parse(path, text))
+        if standing.job is None or standing.problems:
+            raise InvalidJobError(source.describe_all(standing.problems), standing, source, path)
+        _remember(text, standing.job)
     return _JOBS[text]
 
 
@@ -208,32 +224,9 @@ def _remember(text: str, job: Job) -> None:
         del _JOBS[next(iter(_JOBS))]
 
 
-def _validate(document: Mapping[str, Any], source: JobSource) -> Job:
-    """Strict validation: "60" is no number, and 60.0 is no whole number."""
-    try:
-        return job_type().model_validate(_with_tuples(document), strict=True)
-    except ValidationError as error:
-        raise JobFileError(source.describe_all(explain(error, document))) from None
-
-
-def _with_tuples(value: Any) -> Any:
-    """The document with tuples for lists: the models hold tuples, and strict validation converts nothing."""
-    if isinstance(value, Mapping):
-        return {key: _with_tuples(child) for key, child in value.items()}
-    return tuple(_with_tuples(child) for child in value) if isinstance(value, list) else value
-
-
 def _with_absolute_files(job: Job, text: str, path: Path) -> tuple[Job, str]:
     """A job and its text with relative files, which are of the text's own folder, named by absolute paths."""
-    files = list(input_files(job))
-    if job.render.blender is not None:
-        files.append(InputFile(("render", "blender"), job.render.blender, "program"))
-    folder = path.resolve().parent
-    changes = [
-        Override(file.place, file.written((folder / file.path).as_posix()), path.name)
-        for file in files
-        if not Path(file.path).is_absolute()
-    ]
+    changes = _absolute_files(job, path)
     if not changes:
         return job, text
     text = changed_text(text, changes)
@@ -241,3 +234,15 @@ def _with_absolute_files(job: Job, text: str, path: Path) -> tuple[Job, str]:
         job = with_value(job, change.path, change.value)
     _remember(text, job)
     return job, text
+
+
+def _absolute_files(job: Job, path: Path) -> list[Override]:
+    files = list(input_files(job))
+    if job.render.blender is not None:
+        files.append(InputFile(("render", "blender"), job.render.blender, "program"))
+    folder = path.resolve().parent
+    return [
+        Override(file.place, file.written((folder / file.path).as_posix()), path.name)
+        for file in files
+        if not Path(file.path).is_absolute()
+    ]

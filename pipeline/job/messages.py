@@ -11,6 +11,7 @@ from pipeline.job import schema
 from pipeline.model.job import NAME_PATTERN
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Problem, quoted_list, suggestion
+from sim.core.parameters import KeyRefusedError
 
 _EXPECTED = {
     "float_type": "a number",
@@ -75,6 +76,8 @@ def _written_path(details: ErrorDetails, document: object) -> KeyPath:
     location = details["loc"]
     if details["type"] == "missing":
         location = location[:-1]  # the table or list that lacks it is what the user can see
+    if details["type"] == "value_error" and isinstance(error := details["ctx"]["error"], KeyRefusedError):
+        location = (*location, *error.path)
     path: KeyPath = ()
     for part in location:
         if isinstance(document, Mapping) and part in document:

@@ -4,7 +4,7 @@ Changes go into the TOML text itself, so the copy in the job's folder keeps the 
 """
 
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,9 @@ from tomlkit.exceptions import TOMLKitError
 from pipeline.job import schema
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import format_path, suggestion
+
+INSTEAD = {"frames": "duration", "duration": "frames"}
+"""Keys of which a job has one: what sets one takes the other away."""
 
 
 class OverrideError(ValueError):
@@ -53,7 +56,7 @@ def parse_override(argument: str, document: Mapping[str, Any]) -> Override:
     return Override(path, value, "--set")
 
 
-def apply_overrides(text: str, overrides: Iterable[Override]) -> str:
+def apply_overrides(text: str, overrides: Sequence[Override]) -> str:
     """The TOML text with the overrides in it; comments and order stay.
 
     Raises OverrideError: a key on the way holds something else than a table.
@@ -62,6 +65,10 @@ def apply_overrides(text: str, overrides: Iterable[Override]) -> str:
         document = tomlkit.parse(text)
         for override in overrides:
             _put(document, override)
+        given = {override.path[0] for override in overrides}
+        for key, instead in INSTEAD.items():
+            if key in given and instead not in given:
+                document.pop(instead, None)
         return tomlkit.dumps(document)
     except TOMLKitError as error:
         raise OverrideError(f"cannot edit the job file: {error}") from error

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
+from sim.scene import SceneParameters
 from sim.smoke.parameters import SmokeParameters
 
 Box = NDArray[np.float64]
@@ -21,6 +22,11 @@ def domain_box(domain: DomainParameters) -> Box:
 def smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
     """The box of a smoke as the job gives it, empty or not."""
     return np.array([smoke.min or domain.min, smoke.max or domain.max])
+
+
+def simulated_regions(scene: SceneParameters) -> list[Box]:
+    """The boxes in which something happens: the domain, and each smoke's."""
+    return [domain_box(scene.domain), *(smoke_box(smoke, scene.domain) for smoke in scene.smoke)]
 
 
 def overlap(a: Box, b: Box) -> float:

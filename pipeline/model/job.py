@@ -16,6 +16,7 @@ from render.parameters import (
     SurfaceParameters,
     VolumeParameters,
 )
+from sim.core.parameters import KeyRefusedError
 from sim.scene import SceneParameters
 from sim.whitewater.parameters import WhitewaterParameters
 
@@ -112,22 +113,24 @@ class Job(SceneParameters):
         return self
 
     def _require_body_of_camera(self, key: str, name: str) -> None:
-        rigid = tuple(body.name for body in self.rigid)
+        path, rigid = ("camera", key), tuple(body.name for body in self.rigid)
         if name not in rigid and name in self._named:
-            raise ValueError(f'camera.{key}: "{name}" is no rigid body; its shape changes, so it has no one place')
+            raise KeyRefusedError(path, f'"{name}" is no rigid body; its shape changes, so it has no one place')
         if key == "follow" and name in rigid and name not in self.moving_bodies:
-            raise ValueError(f'camera.follow: "{name}" is static; set camera.look_at to look at it')
+            raise KeyRefusedError(path, f'"{name}" is static; set camera.look_at to look at it')
         known = self.moving_bodies if key == "follow" else rigid
         if name not in known:
             kind, plural = "rigid body", "rigid bodies"
             if key == "follow":
                 kind, plural = "dynamic or kinematic rigid body", "moving bodies"
-            raise ValueError(f"camera.{key}: {unknown_name(name, known, kind, plural=plural)}")
+            raise KeyRefusedError(path, unknown_name(name, known, kind, plural=plural))
 
     @model_validator(mode="after")
     def _frames_or_duration(self) -> Self:
         if self.frames is not None and self.duration is not None:
-            raise ValueError("give frames or duration, not both")
+            raise KeyRefusedError(("duration",), "give frames or duration, not both")
         if self.duration is not None and self.duration * self.fps > MAX_FRAMES:
-            raise ValueError(f"duration of {self.duration:g} s at {self.fps} fps is more than {MAX_FRAMES:,} frames")
+            raise KeyRefusedError(
+                ("duration",), f"{self.duration:g} s at {self.fps} fps are more than {MAX_FRAMES:,} frames"
+            )
         return self

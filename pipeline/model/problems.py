@@ -22,11 +22,12 @@ class Problem:
 
 @dataclass(slots=True)
 class Findings:
-    """Findings of the checks: problems in any order, and about how many elements the bodies have, by kind."""
+    """Findings of the checks: problems in any order, what is good to know, and about how many elements there are."""
 
     errors: list[Problem] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
-    elements: dict[str, int] = field(default_factory=dict)
+    facts: list[Problem] = field(default_factory=list)
+    elements: dict[str, int] = field(default_factory=dict)  # by kind of body
 
     def error(self, path: KeyPath, message: str) -> None:
         """Note a problem that forbids the job."""

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pipeline.base.errors import JobFileError
 from pipeline.job.checks.job import check_description
-from pipeline.job.loading import LoadedJob, read_job
+from pipeline.job.loading import InvalidJobError, LoadedJob, read_job
 from pipeline.model.job import Job
-from pipeline.model.problems import Findings, suggestion
+from pipeline.model.problems import Findings, Problem, suggestion
 from pipeline.stages import STAGES
 from pipeline.stages.movie import MovieStage
 from pipeline.stages.render import RenderStage
@@ -64,8 +64,21 @@ def load_checked_job(
     path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False, until: Sequence[str] = ()
 ) -> tuple[LoadedJob, Findings]:
     """Read a job file and look at the whole job; its warnings are in place. Raises JobFileError with every problem."""
-    loaded = read_job(path, overrides, preview=preview)
+    try:
+        loaded = read_job(path, overrides, preview=preview)
+    except InvalidJobError as error:
+        raise with_findings(error, until) from None
     findings = check_job(loaded.job, until=until)
     if findings.errors:
         raise JobFileError(loaded.source.describe_all(findings.errors))
     return replace(loaded, warnings=tuple(loaded.source.describe_all(findings.warnings))), findings
+
+
+def with_findings(error: InvalidJobError, until: Sequence[str] = ()) -> JobFileError:
+    """The error with the problems of the scene that the rest of the file describes."""
+    job, standing = error.standing_job(), error.standing
+    if job is None:
+        return error
+    found = [Problem(standing.written(each.path), each.message) for each in check_job(job, until=until).errors]
+    found = [each for each in found if not standing.may_follow(each)]
+    return JobFileError(error.source.describe_all([*standing.problems, *found]))

@@ -66,14 +66,17 @@ class CountedWarning:
     """An event of a solver that should not happen, how often it did over all frames, and in which."""
 
     solver: str
+    kind: str  # of the solver's bodies
     event: CountedEvent
     count: int
     frames: tuple[int, ...]
 
     def __str__(self) -> str:
-        """`water: 3 solves hit their iteration limit, frames 12, 15-16`."""
+        """`water: 3 solves hit their iteration limit, frames 12, 15-16`, and what that means."""
         plural = "s" if len(self.frames) > 1 else ""
-        return f"{self.solver}: {self.event.text(self.count)}, frame{plural} {_ranges(self.frames)}"
+        told = f"{self.solver}: {self.event.text(self.count)}, frame{plural} {_ranges(self.frames)}"
+        meaning = self.event.means.get(self.kind)
+        return f"{told}: {meaning}" if meaning else told
 
     def as_json(self) -> dict[str, object]:
         """For machines."""
@@ -131,15 +134,16 @@ def describe(numbers: FrameNumbers) -> list[str]:
 
 def count_warnings(frames: Iterable[FrameNumbers]) -> list[CountedWarning]:
     """What happened in these frames that should not, by solver."""
-    counts: dict[tuple[str, CountedEvent], dict[int, int]] = {}
+    counts: dict[tuple[str, str, CountedEvent], dict[int, int]] = {}
     totals: dict[tuple[str, CountedEvent], int] = {}
     for each in frames:
         for solver, event, count in _events_of(each.solvers):
             news = count - totals.get((solver, event), 0) if event.running_total else count
             totals[solver, event] = count
             if news > 0:
-                counts.setdefault((solver, event), {})[each.frame] = news
-    return [CountedWarning(solver, event, sum(of.values()), tuple(of)) for (solver, event), of in counts.items()]
+                kind = each.kinds.get(solver, solver)  # solvers of several bodies have the names of their kinds
+                counts.setdefault((solver, kind, event), {})[each.frame] = news
+    return [CountedWarning(*of, sum(news.values()), tuple(news)) for of, news in counts.items()]
 
 
 def unreadable_whitewater(files: Iterable[ArtifactPath]) -> list[str]:
@@ -168,16 +172,17 @@ class SolverWatch:
         artifact = event.receipt.artifact
         try:
             if event.receipt.stage == SIMULATE:
-                solvers = read_numbers(self._layout.path(artifact)).solvers
+                numbers = read_numbers(self._layout.path(artifact))
+                solvers, kinds = numbers.solvers, numbers.kinds
             else:
-                solvers = {_whitewater_solver(artifact): _read_whitewater(self._layout, artifact)}
+                solvers, kinds = {_whitewater_solver(artifact): _read_whitewater(self._layout, artifact)}, {}
         except InvalidArtifactError as error:
             self._say(str(error))
             return
-        for solver, kind, count in _events_of(solvers):
-            if (solver, kind.name) not in self._told:
-                self._told.add((solver, kind.name))
-                warning = CountedWarning(solver, kind, count, (_frame_of(artifact),))
+        for solver, happened, count in _events_of(solvers):
+            if (solver, happened.name) not in self._told:
+                self._told.add((solver, happened.name))
+                warning = CountedWarning(solver, kinds.get(solver, solver), happened, count, (_frame_of(artifact),))
                 self._say(f"{warning}; later ones are counted: pipeline status")
 
 

@@ -52,7 +52,7 @@ class FrameNumbers:
     time_s: float  # simulated
     device: str
     solvers: Mapping[str, Diagnostics]
-    kinds: Mapping[str, str]  # of bodies by name, as which solvers of one body go; empty if not all was asked for
+    kinds: Mapping[str, str]  # of bodies by name, as which solvers of one body go
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def read_numbers(path: Path, only: Collection[str] | None = None) -> FrameNumber
             time_s=float(file.attrs["time_s"]),
             device=str(file.attrs["device"]),
             solvers=_read_diagnostics(file, only),
-            kinds={} if only is not None else {name: _kind_of(group) for name, group in file.get("bodies", {}).items()},
+            kinds={name: _kind_of(group) for name, group in file.get("bodies", {}).items()},
         )
 
 

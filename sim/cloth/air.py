@@ -11,6 +11,7 @@ from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
 from sim.core.arrays import Integers, Vectors
 from sim.core.launch import kernel
+from sim.core.parameters import KeyRefusedError
 
 WIND = -1
 """Source of air that is nothing but the wind of a cloth's parameters."""
@@ -71,7 +72,7 @@ class ClothAir:
             ValueError: air of a coupling would have two densities.
         """
         if self.is_shared and (conflict := conflict_in_one_air(cloths)):
-            raise ValueError(conflict)
+            raise KeyRefusedError(*conflict)
         host = self._state.host
         drag = [
             [0.5 * cloth.air_density * cloth.drag for cloth in cloths],

@@ -284,19 +284,19 @@ THINNEST_AIR = 1.0e-3
 """Least density of air that cloth and smoke share [kg/m³]: thinner air would be thrown about faster than sums hold."""
 
 
-def conflict_in_one_air(cloths: Sequence[ClothParameters]) -> str | None:
-    """Why cloths cannot hang in the air of a smoke, a sentence; each may have none, air_density = 0."""
-    in_air = [cloth for cloth in cloths if cloth.air_density > 0.0]
-    for cloth in in_air:
+def conflict_in_one_air(cloths: Sequence[ClothParameters]) -> tuple[tuple[str | int, ...], str] | None:
+    """The key, from the scene, by which a cloth cannot hang in the air of a smoke, and why; cloths may have none."""
+    in_air = [(index, cloth) for index, cloth in enumerate(cloths) if cloth.air_density > 0.0]
+    for index, cloth in in_air:
+        path, said = ("cloth", index, "air_density"), f'is {cloth.air_density:g} kg/m³ for "{cloth.name}"'
+        first = in_air[0][1]
         if cloth.air_density < THINNEST_AIR:
+            return path, f"{said}; beside smoke it must be 0, or {THINNEST_AIR:g} kg/m³ at least"
+        if cloth.air_density != first.air_density:
             return (
-                f'air_density of cloth "{cloth.name}" is {cloth.air_density:g} kg/m³; beside smoke it must be 0, or '
-                f"{THINNEST_AIR:g} kg/m³ at least"
-            )
-        if cloth.air_density != in_air[0].air_density:
-            return (
-                f'air_density of cloth "{cloth.name}" is {cloth.air_density:g} kg/m³, but that of '
-                f'"{in_air[0].name}" {in_air[0].air_density:g} kg/m³; smoke has one air: give them the same, or 0'
+                path,
+                f'{said}, but {first.air_density:g} kg/m³ for "{first.name}"; smoke has one air: '
+                "give them the same, or 0",
             )
     return None
 

@@ -17,3 +17,11 @@ class Parameters(BaseModel):
     """Frozen, strict about unknown keys and about NaN; units stand in each field's description."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class KeyRefusedError(ValueError):
+    """A rule of a whole table that one of its keys breaks, at `path` from that table."""
+
+    def __init__(self, path: tuple[str | int, ...], message: str) -> None:
+        super().__init__(message)
+        self.path = path

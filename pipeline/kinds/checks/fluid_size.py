@@ -12,7 +12,7 @@ from pipeline.model.amounts import count, gigabytes, rounded_up
 from pipeline.model.boxes import ALL, domain_box, overlap, span, touch
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings
+from pipeline.model.problems import Findings, Problem
 from sim.core.domain import DomainParameters
 from sim.fluid.filling import free_places
 from sim.fluid.parameters import FluidParameters
@@ -116,7 +116,15 @@ def _check_block(job: Job, path: KeyPath, solids: Solids, coarsening: float, fin
             f"holds no particle: it is {thinnest:.3g} m thin and particles are {spacing:.3g} m apart; "
             "enlarge it or use a smaller particle_radius",
         )
+    if left and not kept_out:
+        _tell_masses(job.fluid[int(path[1])], path, solid.volume * inside, left, findings)
     return left
+
+
+def _tell_masses(fluid: FluidParameters, path: KeyPath, volume: float, particles: int, findings: Findings) -> None:
+    """Tell the mass of a block's particles, and that of its volume [m³] in the domain."""
+    meant, made = fluid.rest_density * volume, fluid.rest_density * fluid.lattice_volume * particles
+    findings.facts.append(Problem(path, f"holds {made:.3g} kg of {fluid.name}, {meant:.3g} kg by its volume"))
 
 
 def _fill(

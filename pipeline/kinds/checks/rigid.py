@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.kinds.base import Solids
-from pipeline.model.boxes import domain_box, overlap, smoke_box, span
+from pipeline.model.boxes import domain_box, overlap, simulated_regions, span
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 from sim.rigid.solver import RigidSolver
@@ -18,8 +18,7 @@ ROUND_OFF = 1.0e-6
 
 def check_places(job: Job, solids: Solids, findings: Findings) -> None:
     """Note bodies that are wholly outside of the domain and of every smoke's box."""
-    domain = domain_box(job.domain)
-    regions = [domain, *(smoke_box(smoke, job.domain) for smoke in job.smoke)]
+    domain, regions = domain_box(job.domain), simulated_regions(job)
     for path, solid in solids.items():
         if path[0] == "rigid" and not any(overlap(solid.bounds, region) for region in regions):
             findings.error(path, f"is wholly outside the domain: it spans {span(solid.bounds)}, not {span(domain)}")

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pipeline.model.boxes import Box
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, suggestion
 from sim.shapes.parameters import MeshShape, Placement
+
+OUT_OF_SCALE = 30.0
+"""A mesh so many times larger than the scene is not meant: a cell of its grid of distances is a tenth of the scene."""
 
 if TYPE_CHECKING:
     from pipeline.kinds.base import Solids
@@ -32,6 +38,29 @@ def build_solids(placements: Iterable[tuple[KeyPath, Placement]], findings: Find
         for warning in solids[path].warnings:
             findings.warn((*path, "shape"), warning)
     return solids
+
+
+def in_scale(solids: Solids, regions: Sequence[Box], findings: Findings) -> Solids:
+    """The solids but for meshes far larger than the boxes that are simulated [m], (2, 3) each, which are noted.
+
+    They are in another unit most likely, and their distances, on a grid, would be coarser than the scene.
+    """
+    from sim.shapes.mesh_solid import MeshSolid
+
+    room = float(np.max(np.max(regions, axis=0)[1] - np.min(regions, axis=0)[0]))
+    kept = {}
+    for path, solid in solids.items():
+        extent = float(np.max(solid.bounds[1] - solid.bounds[0]))
+        if not isinstance(solid.shape, MeshSolid) or extent < OUT_OF_SCALE * room:
+            kept[path] = solid
+            continue
+        unit, factor = ("millimetres", 0.001) if extent > 10.0 * OUT_OF_SCALE * room else ("centimetres", 0.01)
+        findings.error(
+            (*path, "shape"),
+            f"is {extent:.3g} m long in a scene of {room:.3g} m; if its file is in {unit}, scale = {factor:g} makes it "
+            f"{extent * factor:.3g} m, and shape.size gives its longest edge in metres",
+        )
+    return kept
 
 
 def mesh_exists(shape: object, path: KeyPath, findings: Findings) -> bool:

@@ -283,10 +283,13 @@ class ProcessExecutor(Executor):
         if worker.assignment is None:
             return
         stall_s, timeout_s = worker.stall_s, worker.assignment.timeout_s or inf
+        limits = f"limits.{worker.assignment.task.stage}"
         if now - worker.last_sign >= stall_s:
-            kind, sentence = FailureKind.STALLED, f"no sign of life for {stall_s:g} s; the log shows where it hung"
+            kind = FailureKind.STALLED
+            sentence = f"no sign of life for {stall_s:g} s, which is {limits}.stall_s; the log shows where it hung"
         elif now - worker.limited_since >= timeout_s:
-            kind, sentence = FailureKind.TIMED_OUT, f"not done after {timeout_s:g} s; the log shows where it was"
+            kind = FailureKind.TIMED_OUT
+            sentence = f"not done after {timeout_s:g} s, which is {limits}.timeout_s; the log shows where it was"
         else:
             return
         worker.end_by(now + _STACK_DUMP_S, kind, sentence)
@@ -298,6 +301,9 @@ class ProcessExecutor(Executor):
             return
         limit, size = worker.assignment.memory_bytes or self._task_memory_limit, worker.look_at_memory()
         if size > limit:
-            sentence = f"its processes held {size / 1e9:.3g} GB together, and may hold {limit / 1e9:.3g} GB"
+            sentence = (
+                f"its processes held {size / 1e9:.3g} GB together, and may hold {limit / 1e9:.3g} GB "
+                f"(limits.{worker.assignment.task.stage}.memory_gb)"
+            )
             worker.leave_evidence(sentence)
             worker.end_by(now, FailureKind.OUT_OF_MEMORY, sentence)

@@ -6,7 +6,7 @@ import pytest
 from checked_jobs import says
 
 from pipeline.base.errors import JobFileError
-from pipeline.job.loading import LoadedJob, read_job
+from pipeline.job.loading import LoadedJob, load_job, read_job
 from pipeline.job.starter import TEMPLATES, starter
 
 TEXT = """\
@@ -168,3 +168,13 @@ def test_problem_that_the_preview_causes_names_the_option(tmp_path):
     with pytest.raises(JobFileError) as error:
         loaded(tmp_path, text=TEXT.replace('"water"', '"water"\nparticle_radius = 1e308'), preview=True)
     assert error.value.problems == ["--preview fluid[0].particle_radius: must be finite, got inf"]
+
+
+def test_frames_take_the_place_of_a_duration_and_the_other_way_round(tmp_path):
+    path = tmp_path / "dam.toml"
+    path.write_text('name = "dam"\nduration = 2.0\n')
+    assert load_job(path, ["frames=40"]).frame_count == 40
+    path.write_text('name = "dam"\nframes = 40\n')
+    assert load_job(path, ["duration=2"]).frame_count == 120
+    with pytest.raises(JobFileError, match="not both"):
+        load_job(path, ["duration=2", "frames=3"])

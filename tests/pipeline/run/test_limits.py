@@ -183,7 +183,7 @@ def test_a_stalled_task_is_ended_with_its_processes_and_stacks_in_its_log(execut
     failed = failure(run(executor, limited(layout, "film", stall_s=5.0)))
     assert (failed.kind, failed.message) == (
         FailureKind.STALLED,
-        "no sign of life for 5 s; the log shows where it hung",
+        "no sign of life for 5 s, which is limits.film.stall_s; the log shows where it hung",
     )
     log = layout.log(TaskId("film"), 1).read_text()
     assert "the runner ends this attempt: no sign of life for 5 s" in log

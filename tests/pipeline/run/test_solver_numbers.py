@@ -14,9 +14,9 @@ from pipeline.base.task import TaskId
 from pipeline.job.loading import load_job
 from pipeline.run.events import Committed
 from pipeline.run.plan import plan_job
-from pipeline.run.solver_numbers import SolverWatch, simulation_numbers
+from pipeline.run.solver_numbers import SolverWatch, count_warnings, simulation_numbers
 from pipeline.stages import STAGES
-from pipeline.store.cache import read_numbers
+from pipeline.store.cache import FrameNumbers, read_numbers
 
 
 @pytest.fixture
@@ -65,7 +65,18 @@ def test_what_should_not_happen_is_counted_with_its_frames(layout, name, counts,
     """Lost bodies are told as a total since the start."""
     for frame, count in enumerate(counts):
         commit(layout, frame, **{name: float(count)})
-    assert f"warning: water: {warning}\n" in status(layout)
+    assert f"warning: water: {warning}" in status(layout)
+
+
+@pytest.mark.parametrize(
+    ("solver", "kinds"), [("tank", {"tank": "fluid"}), ("fluid", {"water": "fluid", "oil": "fluid"})]
+)
+def test_a_warning_says_what_it_means_for_its_kind_and_what_to_set(solver, kinds):
+    """The solver of several fluids is called as their kind."""
+    frame = FrameNumbers(3, 0.05, "cpu", {solver: {"not_converged": 2.0}, "plume": {"not_converged": 1.0}}, kinds)
+    of_fluid, of_plume = count_warnings([frame])
+    assert "max_iterations" in str(of_fluid)
+    assert str(of_plume) == "plume: 1 solve hit its iteration limit, frame 3"
 
 
 def test_status_for_machines_has_all_of_it(layout):
@@ -80,7 +91,7 @@ def test_status_for_machines_has_all_of_it(layout):
             "name": "not_converged",
             "count": 2,
             "frames": [0],
-            "text": "water: 2 solves hit their iteration limit, frame 0",
+            "text": str(simulation_numbers(layout).warnings()[0]),
         }
     ]
 
@@ -120,7 +131,9 @@ def test_a_run_tells_a_warning_once_when_it_first_happens(layout):
     for frame, count in enumerate([0, 3, 1]):
         receipt = commit(layout, frame, not_converged=float(count))
         watch.notify(Committed(TaskId("simulate"), 1, receipt))
-    assert said == ["water: 3 solves hit their iteration limit, frame 1; later ones are counted: pipeline status"]
+    (once,) = said
+    assert once.startswith("water: 3 solves hit their iteration limit, frame 1: ")
+    assert once.endswith("; later ones are counted: pipeline status")
 
 
 def test_whitewater_that_had_no_room_is_counted_with_its_frames(layout):

@@ -131,7 +131,7 @@ def test_cloth_beside_smokes_whose_boxes_overlap_is_refused(tmp_path):
     apart = other.replace("max = [0.5, 0.5, 0.4]", "min = [0.5, -0.5, 0.0]\nmax = [1.5, 0.5, 1.0]").replace(
         "[0.0,", "[0.8,"
     )
-    with pytest.raises(JobFileError, match='the boxes of smoke "plume" and "fog" overlap'):
+    with pytest.raises(JobFileError, match=r'smoke\[1\]: its box and that of "plume" overlap'):
         warnings(SHEET + PLUME + other, tmp_path)
     assert warnings(SHEET + PLUME + apart, tmp_path) == []
 
@@ -140,7 +140,7 @@ def test_cloths_of_two_airs_beside_smoke_are_refused(tmp_path):
     other = SHEET[SHEET.index("[[cloth]]") :].replace('"sheet"', '"other"')
     thin, none = "air_density = 0.6\n", "air_density = 0.0\n"
     apart = other.replace("0.5]", "0.9]")
-    with pytest.raises(JobFileError, match=r'air_density of cloth "other" is 0\.6 kg/m³, but that of "sheet" 1\.2'):
+    with pytest.raises(JobFileError, match=r'is 0\.6 kg/m³ for "other", but 1\.2 kg/m³ for "sheet"'):
         warnings(SHEET + apart + thin + PLUME, tmp_path)
     assert warnings(SHEET + apart + none + PLUME, tmp_path) == []
     assert warnings(SHEET + apart + thin, tmp_path) == []

@@ -85,6 +85,24 @@ def test_what_is_hardly_meant_is_warned_of(text, expected, tmp_path):
     assert any(says(warning, f"tank.toml:{expected}") for warning in warnings), warnings
 
 
+@pytest.mark.parametrize(("thickness", "is_warned_of"), [(0.01, True), (0.08, False)])
+def test_a_plate_thinner_than_the_particles_can_hold_is_warned_of(thickness, is_warned_of, tmp_path):
+    plate = f'[[rigid]]\nname = "plate"\nshape = {{ type = "box", size = [0.5, 0.5, {thickness}] }}\n'
+    errors, warnings, _ = checked(HEAD + WATER + plate + "position = [0, 0, 0.6]\n", tmp_path / "tank.toml")
+    assert errors == []
+    expected = "tank.toml:12 rigid[0].shape: is 0.01 m thin ... 0.076 m ... particle_radius 0.0026 m"
+    assert [says(warning, expected) for warning in warnings] == ([True] if is_warned_of else [])
+
+
+def test_the_mass_of_a_block_is_told_beside_that_of_its_volume(tmp_path):
+    cube = WATER.replace("[1.0, 1.0, 0.2]", "[0.3, 0.3, 0.3]").replace("0.1]", "0.5]")
+    _, _, findings = checked(HEAD + cube, tmp_path / "tank.toml")
+    (fact,) = findings.facts
+    assert fact.path == ("fluid", 0, "block", 0)
+    made = findings.elements["fluid"] * 1000.0 * 0.04**3
+    assert fact.message == f"holds {made:.3g} kg of water, 27 kg by its volume"
+
+
 def test_an_emitter_in_a_solid_body_is_refused(tmp_path):
     ball = '[[rigid]]\nname = "ball"\nshape = { type = "sphere", radius = 0.2 }\nposition = [0.0, 0.0, 0.9]\n'
     errors, _, _ = checked(HEAD + ball + JET, tmp_path / "tank.toml")

@@ -213,7 +213,7 @@ class TestProcesses(ProcessesContract):
         failed = failure(run(executor, assign(layout, "film", timeout_s=2.0)))
         assert (failed.kind, failed.message) == (
             FailureKind.TIMED_OUT,
-            "not done after 2 s; the log shows where it was",
+            "not done after 2 s, which is limits.film.timeout_s; the log shows where it was",
         )
 
     def test_what_is_prepared_once_is_ended_neither_as_stalled_nor_by_the_time_limit_that_counts_after_it(self, layout):
