@@ -66,6 +66,7 @@ class Product:
     write: Callable[[Path, Any, Job, int], None]  # makes the file of a body, with so many threads
     validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError
     file_bytes: Callable[[float], float]  # about the size of a file by the number of the body's elements
+    about: str = ""  # what they are, in a few words for people
     preflight: Callable[[], list[str]] = list  # why this machine cannot make it, a sentence each
 
     def file_of(self, body: str) -> str:

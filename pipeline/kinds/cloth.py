@@ -120,6 +120,7 @@ def _write_mesh(path: Path, cloth: Snapshot, _job: Job, _threads: int) -> None:
 
 MESH = Product(
     stage="cloth",
+    about="meshes of cloths",
     version=1,
     folder="cloths",
     suffix=".ply",

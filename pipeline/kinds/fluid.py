@@ -149,6 +149,7 @@ def _facts(fluid: FluidParameters, count: float | None) -> str:
 
 SURFACE = Product(
     stage="surface",
+    about="surfaces of fluids",
     version=2,
     folder="surfaces",
     suffix=".ply",

@@ -115,6 +115,7 @@ def _write_volume(path: Path, smoke: SmokeInBox, job: Job, _threads: int) -> Non
 
 VOLUME = Product(
     stage="volume",
+    about="smoke as OpenVDB",
     version=2,
     folder="volumes",
     suffix=".vdb",

@@ -9,14 +9,15 @@ import click
 from pipeline.base.errors import DamagedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import LeaseHolder, busy_error, live_holder
-from pipeline.base.task import TaskState
+from pipeline.base.task import TaskId, TaskState
 from pipeline.queue.farm import start_in_background
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob
 from pipeline.queue.states import ending_of
-from pipeline.record.reader import LastRun, StageSummary, done_and_total, record_of
+from pipeline.record.reader import LastRun, ManifestReader, StageSummary, done_and_total, record_of
 from pipeline.run.events import JobOutcome
 from pipeline.run.goal import what_is_made
 from pipeline.run.progress import Display, StageProgress, open_display
+from pipeline.run.solver_numbers import SIMULATE
 
 POLL_INTERVAL_S = 0.5
 
@@ -34,7 +35,7 @@ def watch(layout: JobLayout) -> int:
     """
     watched: str | None = None
     preview_said = False
-    display = open_display()
+    display = open_display(layout.root.absolute().name)
     stages: dict[str, StageProgress] = {}
     try:
         while True:
@@ -42,7 +43,7 @@ def watch(layout: JobLayout) -> int:
             if holder is not None:
                 watched = holder.token
             summary, last_run = record_of(layout)
-            _update(stages, summary)
+            _update(stages, layout, summary)
             display.show(stages.values())
             preview_said = preview_said or (holder is not None and _say_preview_movie(display, layout))
             if holder is None:
@@ -96,7 +97,7 @@ class Follower:
         Returns 0 if its run says that it has done everything, else what `submit` would have returned; None if somebody
         has to run the queue, and nobody does. CTRL_C after Ctrl-C: the job stays in the queue.
         """
-        display = open_display()
+        display = open_display(self._name)
         stages: dict[str, StageProgress] = {}
         try:
             while True:
@@ -104,7 +105,7 @@ class Follower:
                 holder = live_holder(self._layout.lease)
                 runs = holder is not None
                 summary, last_run = _record_to_be(self._layout)
-                _update(stages, summary)
+                _update(stages, self._layout, summary)
                 if holder is not None:
                     self._seen_running = True
                     self._name_holder(holder, display.say)
@@ -185,12 +186,17 @@ def _say_preview_movie(display: Display, layout: JobLayout) -> bool:
     return True
 
 
-def _update(stages: dict[str, StageProgress], summary: list[StageSummary]) -> None:
+def _update(stages: dict[str, StageProgress], layout: JobLayout, summary: list[StageSummary]) -> None:
+    """Count as the run itself does, by files: the simulation's one task makes one a frame."""
     now = time.monotonic()
     for counts in summary:
-        done = counts.done
-        stage = stages.setdefault(counts.stage, StageProgress(counts.stage, counts.total, done, at_start=done))
-        stage.total = counts.total
+        done, total = counts.done, counts.total
+        if counts.stage == SIMULATE:
+            with ManifestReader.open_readonly(layout.manifest) as manifest:
+                total = manifest.frame_count() or total
+                done = total if counts.done else min(total, manifest.artifacts_of(TaskId(SIMULATE))[0])
+        stage = stages.setdefault(counts.stage, StageProgress(counts.stage, total, done, at_start=done))
+        stage.total = total
         stage.failed = counts.counts.get(TaskState.FAILED, 0)
         if done > stage.done:
             stage.advance(done - stage.done, now)

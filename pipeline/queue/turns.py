@@ -28,6 +28,7 @@ from pipeline.run.executors.choice import ExecutorChoice, open_machines
 from pipeline.run.progress import ProgressObserver, open_display
 from pipeline.run.runner import run_job
 from pipeline.run.solver_numbers import SolverWatch
+from pipeline.stages import STAGES
 from sim.core.runtime import cuda_gpus
 
 GPU_TASKS = 1
@@ -177,7 +178,7 @@ def _run_once(
         frames = None if entry.rerun_frames is None else frozenset(entry.rerun_frames)
         rerun = Selection(frozenset(entry.rerun_stages), frames)
     with (
-        ProgressObserver(open_display()) as progress,
+        ProgressObserver(open_display(job.name), {stage.name: stage.about for stage in STAGES}) as progress,
         open_machines(choice, layout, capacity, progress.display.say) as machines,
         ExitStack() as stack,
     ):

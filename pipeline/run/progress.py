@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Self, TextIO
@@ -32,8 +32,21 @@ class StageProgress:
     failed: int = 0
     message: str = ""
     at_start: int = 0
+    about: str = ""  # what it makes, in a few words
     began: float | None = None
     ended: float | None = None
+    _preparing_since: float | None = None
+
+    def prepare(self, now: float) -> None:
+        """From now on [monotonic s] it does what is done once on a machine, which says nothing about its rate."""
+        if self._preparing_since is None:
+            self._preparing_since = now
+
+    def end_preparing(self, now: float) -> None:
+        """It goes on; what it prepared for does not count."""
+        if self._preparing_since is not None and self.began is not None:
+            self.began += now - max(self._preparing_since, self.began)
+        self._preparing_since = None
 
     def advance(self, artifacts: int, now: float) -> None:
         """So many more are committed at monotonic time `now` [s]."""
@@ -44,7 +57,7 @@ class StageProgress:
 
     def rate(self, now: float) -> float | None:
         """Artifacts a second of this run; None before there are three, as two may come at once."""
-        if self.began is None or self.done - self.at_start < 3:
+        if self.began is None or self._preparing_since is not None or self.done - self.at_start < 3:
             return None
         seconds = (self.ended or now) - self.began
         # The first one only starts the clock, as its beginning was not seen.
@@ -73,6 +86,7 @@ class ProgressObserver:
     """Turns a run's events into progress by stage. A context manager that closes its display."""
 
     display: Display
+    about: Mapping[str, str] = field(default_factory=dict)  # what stages make, by their names
     stages: dict[str, StageProgress] = field(default_factory=dict)
     _awaited: dict[TaskId, set[ArtifactPath]] = field(default_factory=dict)
     _stage_of: dict[TaskId, str] = field(default_factory=dict)
@@ -87,10 +101,13 @@ class ProgressObserver:
             case Committed(task_id, _, receipt):
                 self._count(task_id, {receipt.artifact}, now)
             case Progress(task_id, _, _, _, message, preparing):
-                stage = self._stage_of[task_id]
-                self.stages[stage].message = message
+                stage = self.stages[self._stage_of[task_id]]
+                stage.message = message
                 if preparing and message:  # it takes minutes, and nobody is to take it for a hang
-                    self._say_once(stage, message, f"{stage}: {message}")
+                    stage.prepare(now)
+                    self._say_once(stage.name, message, f"{stage.name}: {message}")
+                elif not preparing:
+                    stage.end_preparing(now)
             case StateChanged(task_id, _, TaskState.UP_TO_DATE | TaskState.SUCCEEDED):
                 self._count(task_id, self._awaited[task_id], now)
             case StateChanged(task_id, stage, TaskState.FAILED):
@@ -114,7 +131,8 @@ class ProgressObserver:
         for assessment in assessments:
             task = assessment.task
             done = len(task.outputs) - len(assessment.rebuilds)
-            stage = self.stages.setdefault(task.stage, StageProgress(task.stage, 0, 0))
+            about = self.about.get(task.stage, "")
+            stage = self.stages.setdefault(task.stage, StageProgress(task.stage, 0, 0, about=about))
             stage.total += len(task.outputs)
             stage.done += done
             stage.at_start += done
@@ -141,10 +159,19 @@ class ProgressObserver:
         self.display.close()
 
 
-class LiveDisplay:
-    """A bar a stage, redrawn in place (rich)."""
+def remaining_of_all_s(stages: Iterable[StageProgress], now: float) -> float | None:
+    """Estimated time until all stages are done [s], one after the other; None while a rate is not known."""
+    left = [stage.remaining_s(now) for stage in stages if stage.done < stage.total]
+    known = [each for each in left if each is not None]
+    return sum(known) if known and len(known) == len(left) else None
 
-    def __init__(self, console: Console) -> None:
+
+class LiveDisplay:
+    """A bar for the job `name` and one a stage, redrawn in place (rich)."""
+
+    def __init__(self, console: Console, name: str) -> None:
+        self._began = time.monotonic()
+        self._name = name
         self._progress = bars.Progress(
             bars.TextColumn("{task.fields[name]:>9}"),
             bars.BarColumn(bar_width=30),
@@ -158,20 +185,21 @@ class LiveDisplay:
 
     def show(self, stages: Iterable[StageProgress]) -> None:
         """Update the bars."""
-        now = time.monotonic()
+        now, stages = time.monotonic(), list(stages)
+        left = remaining_of_all_s(stages, now)
+        times = f"{wording.duration(now - self._began)} so far"
+        counts = times if left is None else f"{times}, about {wording.duration(left)} left"
+        done, total = (sum(getattr(stage, key) for stage in stages) for key in ("done", "total"))
+        if stages:
+            self._update(self._name, done, total, counts)
         for stage in stages:
-            if stage.name not in self._bars:
-                self._bars[stage.name] = self._progress.add_task(
-                    stage.name, name=stage.name, counts="", message="", total=stage.total
-                )
-            message = "" if stage.done >= stage.total else stage.message
-            self._progress.update(
-                self._bars[stage.name],
-                completed=stage.done,
-                total=stage.total,
-                counts=stage.describe(now),
-                message=message,
-            )
+            message = "" if stage.done >= stage.total else stage.message or stage.about
+            self._update(stage.name, stage.done, stage.total, stage.describe(now), message)
+
+    def _update(self, name: str, done: int, total: int, counts: str, message: str = "") -> None:
+        if name not in self._bars:
+            self._bars[name] = self._progress.add_task(name, name=name, counts="", message="", total=total)
+        self._progress.update(self._bars[name], completed=done, total=total, counts=counts, message=message)
 
     def say(self, sentence: str, *, style: str = "") -> None:
         """Print above the bars."""
@@ -189,6 +217,7 @@ class PlainDisplay:
         self._stream = stream
         self._began = time.monotonic()
         self._said: dict[str, tuple[float, int]] = {}
+        self._explained: set[str] = set()
 
     def show(self, stages: Iterable[StageProgress]) -> None:
         """A line for each stage that moved, every so often, and for its end."""
@@ -198,7 +227,9 @@ class PlainDisplay:
             ended = stage.done >= stage.total
             if stage.done != done and (ended or now - said >= PLAIN_INTERVAL_S):
                 self._said[stage.name] = (now, stage.done)
-                self.say(f"{stage.name} {stage.describe(now)}")
+                about = f" ({stage.about})" if stage.about and stage.name not in self._explained else ""
+                self._explained.add(stage.name)
+                self.say(f"{stage.name}{about} {stage.describe(now)}")
 
     def say(self, sentence: str, *, style: str = "") -> None:  # noqa: ARG002 - colours are for terminals
         """Print with the time since the start. Nobody listening any more (`| head`) is no reason to end the run."""
@@ -212,7 +243,7 @@ class PlainDisplay:
 Display = LiveDisplay | PlainDisplay
 
 
-def open_display() -> Display:
-    """Live bars if standard error is a terminal, else plain lines."""
+def open_display(name: str) -> Display:
+    """Display of the job `name`: live bars if standard error is a terminal, else plain lines."""
     console = Console(stderr=True)
-    return LiveDisplay(console) if console.is_terminal else PlainDisplay(sys.stderr)
+    return LiveDisplay(console, name) if console.is_terminal else PlainDisplay(sys.stderr)

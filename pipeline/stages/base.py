@@ -52,6 +52,7 @@ class Stage(Protocol):
 
     name: str
     version: int  # raised when the same parameters and inputs give other outputs; part of the fingerprint
+    about: str = ""  # what it makes, in a few words for people
 
     @abstractmethod
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

@@ -19,6 +19,7 @@ class BodiesStage(Stage):
     """One PLY per rigid body and part of its shape, in its rest pose, wherever it stands in the scene."""
 
     name = "bodies"
+    about = "meshes of rigid bodies"
     version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

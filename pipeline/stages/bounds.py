@@ -42,6 +42,7 @@ class BoundsStage(Stage):
     """
 
     name = "bounds"
+    about = "how far things reach, for the camera"
     version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

@@ -17,6 +17,7 @@ class MovieStage(Stage):
     """Segments of closed groups of pictures, joined without encoding again."""
 
     name = "movie"
+    about = "the film"
     version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

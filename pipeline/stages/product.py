@@ -14,7 +14,7 @@ class ProductStage(Stage):
     """One file a body and frame, each from that frame of the cache alone."""
 
     def __init__(self, kind: Kind, product: Product) -> None:
-        self.name, self.version = product.stage, product.version
+        self.name, self.about, self.version = product.stage, product.about, product.version
         self._kind, self._product = kind, product
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

@@ -51,6 +51,7 @@ class RenderStage(Stage):
     """One PNG a frame, and an EXR if the job asks for one. A worker keeps Blender and the scene warm between frames."""
 
     name = "render"
+    about = "pictures"
     version = 4
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

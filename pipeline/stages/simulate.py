@@ -34,6 +34,7 @@ from pipeline.store.cache import (
 )
 from pipeline.store.provenance import read_text
 from pipeline.store.receipts import read_receipt
+from sim.core.launch import on_compiled
 from sim.core.runtime import DeviceUnavailableError, initialize, resolve_device
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport, World
@@ -55,6 +56,7 @@ class SimulateStage(Stage):
     """One task for the whole job: it commits a frame at a time and continues where it stopped."""
 
     name = "simulate"
+    about = "the physics, frame by frame"
     version = 13
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
@@ -138,6 +140,7 @@ class _Simulation:
         from sim.build import build_world
 
         self._context = context
+        on_compiled(self._tell_compiling)
         self._folder = context.layout.checkpoints
         make_folder(self._folder, within=context.layout.root)
         self._device = initialize(context.job.device, threads=context.threads, gpu=context.gpu)
@@ -169,6 +172,10 @@ class _Simulation:
                 if time.monotonic() - self._checkpointed_at > CHECKPOINT_INTERVAL_S:
                     self._hand_in_checkpoint(writer)
             self._hand_in_checkpoint(writer)
+
+    def _tell_compiling(self, name: str, seconds: float) -> None:
+        print(f"compiled {name} in {seconds:.1f} s", flush=True)
+        self._context.progress(0, 1, "compiling kernels, once on this machine", preparing=True)
 
     def _commit(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
         with (

@@ -43,6 +43,7 @@ class WhitewaterStage(Stage):
     """
 
     name = "whitewater"
+    about = "spray, foam and bubbles"
     version = 3
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

@@ -10,6 +10,7 @@ pins the release that they belong to.
 """
 
 import functools
+import time
 import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,7 +25,16 @@ from sim.core.bundles import flattened, is_used, with_fields_as_arguments
 
 _REAL_TYPES = frozenset(primitive_types.real_types)
 
+SLOW_S = 0.25
+"""A first call that takes longer has compiled its kernel, one that is faster has read it from Taichi's cache [s]."""
+_tell_compiled: list[Callable[[str, float], None]] = []
+
 MOST_LAUNCHES = 256  # most combinations of arrays whose launch context a kernel keeps
+
+
+def on_compiled(tell: Callable[[str, float], None] | None) -> None:
+    """Have `tell(name, seconds)` called after every kernel that had to be compiled in this process; None: nobody."""
+    _tell_compiled[:] = [] if tell is None else [tell]
 
 
 class _Launch(NamedTuple):
@@ -119,6 +129,7 @@ class FastKernel:
 
     def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
         """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
+        began = time.perf_counter()
         result = self._primal(*args)
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
@@ -126,6 +137,9 @@ class FastKernel:
         kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*args)]
         compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
         self._compiled[self._key(args)] = kernel, compiled
+        if (seconds := time.perf_counter() - began) > SLOW_S:
+            for tell in _tell_compiled:
+                tell(self.__name__, seconds)
         return result.to_numpy().tolist() if self._returns_vector else result
 
     def _launch(self, program: Any, compiled: Any, context: Any, args: tuple[Any, ...], passed: list[Any]) -> Any:

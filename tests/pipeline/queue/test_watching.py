@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from record_samples import film
+from record_samples import commit, film
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
@@ -18,6 +18,7 @@ from pipeline.queue.following import CTRL_C, Follower, watch
 from pipeline.queue.job_queue import JobQueue, new_entry
 from pipeline.record.manifest import Manifest
 from pipeline.run.events import JobOutcome
+from pipeline.run.progress import PlainDisplay
 
 TASKS = film(2)
 DONE = {task.id: TaskState.SUCCEEDED for task in TASKS}
@@ -50,6 +51,19 @@ def watch_while(layout: JobLayout, runner: Callable[[Lease], None]) -> int:
         return watch(layout)
     finally:
         running.join()
+
+
+def test_frames_are_counted_as_the_run_itself_counts_them(layout, monkeypatch):
+    """The simulation is one task, and one frame of its two is there."""
+    receipt = commit(layout, TASKS[0], TASKS[0].outputs[0], "frame END")
+    with Manifest(layout.manifest) as manifest:
+        manifest.record_plan(TASKS, {task.id: TaskState.RUNNING for task in TASKS[:1]})
+        manifest.record_artifacts([receipt])
+    seen = {}
+    monkeypatch.setattr(PlainDisplay, "show", lambda _, stages: seen.update({each.name: each for each in stages}))
+    watch(layout)
+    assert (seen["simulate"].done, seen["simulate"].total) == (1, 2)
+    assert (seen["render"].done, seen["render"].total) == (0, 2)
 
 
 def test_a_film_that_was_done_when_its_entry_went_was_not_cancelled(layout):

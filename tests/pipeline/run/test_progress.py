@@ -14,7 +14,7 @@ from pipeline.base import wording
 from pipeline.base.task import FailureKind, Task, TaskId, TaskState
 from pipeline.run.events import Committed, Failed, Notice, Progress, RunStarted, StateChanged
 from pipeline.run.plan import Assessment, Reason, Verdict
-from pipeline.run.progress import LiveDisplay, PlainDisplay, ProgressObserver, StageProgress
+from pipeline.run.progress import LiveDisplay, PlainDisplay, ProgressObserver, StageProgress, remaining_of_all_s
 from pipeline.store.receipts import Receipt
 
 FRAMES = 3
@@ -109,10 +109,53 @@ def test_rate_and_remaining_time_leave_out_the_start_and_what_was_there_already(
     assert stage.describe(16.0) == "44/100, 0.50/s, 1 min 52 s left"
 
 
-def test_a_terminal_shows_a_bar_for_every_stage():
+def test_what_is_done_once_on_a_machine_says_nothing_about_the_rate():
+    """Kernels compile for 70 s before the second frame."""
+    stage = StageProgress("simulate", total=100, done=0)
+    stage.advance(1, 0.0)
+    stage.prepare(1.0)
+    stage.prepare(30.0)
+    assert stage.rate(30.0) is None
+    stage.end_preparing(71.0)
+    for now in (72.0, 74.0, 76.0):
+        stage.advance(1, now)
+    assert stage.rate(76.0) == pytest.approx(3 / (76.0 - 70.0))
+
+
+def test_compiling_is_said_once_and_ends_with_the_frame():
+    simulate = film(FRAMES)[0]
+    compiling = Progress(simulate.id, 1, 0, 1, "compiling kernels, once on this machine", preparing=True)
+    observer, printed = observe(RunStarted(all_stale()), committed(simulate, 0), compiling, compiling)
+    assert lines(printed) == ["simulate: compiling kernels, once on this machine"]
+    observer.notify(Progress(simulate.id, 1, 1, FRAMES, "frame 1"))
+    assert observer.stages["simulate"].message == "frame 1"
+
+
+def test_the_time_left_of_all_is_known_once_every_stage_has_a_rate():
+    simulate, render = (StageProgress(name, total=10, done=0) for name in ("simulate", "render"))
+    for now in range(4):
+        simulate.advance(1, float(now))
+    assert remaining_of_all_s([simulate, render], 3.0) is None
+    for now in range(4):
+        render.advance(1, 2.0 * now)
+    assert remaining_of_all_s([simulate, render], 6.0) == pytest.approx(6 / 0.5 + 6 / 0.5)
+    render.advance(6, 8.0)
+    assert remaining_of_all_s([simulate, render], 9.0) == pytest.approx(6 / (3 / 9.0))
+
+
+def test_a_stage_says_what_it_makes_the_first_time():
     stream = io.StringIO()
-    display = LiveDisplay(Console(file=stream, force_terminal=True, width=100))
-    with ProgressObserver(display) as observer:
+    _, first, second, third, _ = film(FRAMES)
+    with ProgressObserver(PlainDisplay(stream), {"render": "pictures"}) as observer:
+        for event in (RunStarted(all_stale()), *map(committed, (first, second, third))):
+            observer.notify(event)
+    assert [line.partition(",")[0] for line in lines(stream.getvalue())] == [f"render (pictures) {FRAMES}/{FRAMES}"]
+
+
+def test_a_terminal_shows_a_bar_for_the_job_and_for_every_stage():
+    stream = io.StringIO()
+    display = LiveDisplay(Console(file=stream, force_terminal=True, width=100), "my-film")
+    with ProgressObserver(display, {"movie": "the film"}) as observer:
         observer.notify(RunStarted(all_stale()))
         simulate = film(FRAMES)[0]
         for index in range(FRAMES):
@@ -120,7 +163,8 @@ def test_a_terminal_shows_a_bar_for_every_stage():
         observer.notify(Notice("the disk is full"))
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
     assert re.search(rf"simulate .*{FRAMES}/{FRAMES}", shown)
-    assert re.search(rf"movie .*0/{1}", shown)
+    assert re.search(rf"movie .*0/{1} +the film", shown)
+    assert re.search("my-film .* s so far", shown)
     assert "the disk is full" in shown
 
 

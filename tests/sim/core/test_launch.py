@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.core.launch import MOST_LAUNCHES, FastKernel, kernel
+from sim.core.launch import MOST_LAUNCHES, FastKernel, kernel, on_compiled
 
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 AnyNumbers = ti.types.ndarray(ndim=1)
@@ -32,6 +32,12 @@ def ends(numbers: Floats, count: ti.i32) -> Pair:
 def halve(numbers: AnyNumbers):
     for i in range(numbers.shape[0]):
         numbers[i] = numbers[i] / 2
+
+
+@kernel
+def double(numbers: Floats):
+    for i in range(numbers.shape[0]):
+        numbers[i] = 2.0 * numbers[i]
 
 
 @kernel
@@ -125,3 +131,16 @@ def test_a_kernel_with_arguments_that_cannot_be_passed_is_refused(taichi_cpu):
 
     with pytest.raises(TypeError, match="cannot pass"):
         FastKernel(of_matrix)
+
+
+def test_a_kernel_that_is_compiled_is_told_once(taichi_cpu, monkeypatch):
+    monkeypatch.setattr("sim.core.launch.SLOW_S", 0.0)  # this small one may come out of Taichi's cache
+    told = []
+    on_compiled(lambda name, seconds: told.append((name, seconds > 0.0)))
+    try:
+        for _ in range(3):
+            double(ti.ndarray(ti.f32, 4))
+    finally:
+        on_compiled(None)
+    double(ti.ndarray(ti.f32, 4))
+    assert told == [("double", True)]
