@@ -115,12 +115,17 @@ def _missing_keys(path: KeyPath, missing: list[str], value: object) -> str:
 
 
 def _unexpected_value(path: KeyPath, errors: list[ErrorDetails], value: object) -> str:
-    expected = dict.fromkeys(_EXPECTED.get(each["type"]) or quoted_list(_words(each, "expected")) for each in errors)
+    expected = dict.fromkeys(_EXPECTED.get(each["type"]) or _literals(each) for each in errors)
     sentence = f"expected {' or '.join(expected)}, got {_spelled(value)}"
     if schema.node_at(path).is_array_of_tables and isinstance(value, Mapping):
         return f"{sentence}; write [[{'.'.join(str(part) for part in path if isinstance(part, str))}]], in two brackets"
     choices = [word for each in errors if each["type"] == "literal_error" for word in _words(each, "expected")]
     return sentence + (suggestion(value, choices) if isinstance(value, str) else "")
+
+
+def _literals(details: ErrorDetails) -> str:
+    words = _words(details, "expected")
+    return quoted_list(words) if "'" in details["ctx"]["expected"] else " or ".join(words)
 
 
 def _words(details: ErrorDetails, key: str) -> list[str]:

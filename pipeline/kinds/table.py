@@ -4,6 +4,7 @@ A new kind of body is a module beside this one and a row here; see docs/architec
 """
 
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from functools import cache, partial
 from typing import Any
 
@@ -130,8 +131,17 @@ def described_material(job: Job, body: str, part: str = BODY) -> MaterialParamet
     if part != BODY and part not in WHITEWATER:
         of_body = described_material(job, body)
         usual = usual if of_body.look and LOOK_TABLE[of_body.look].paints_parts else of_body
-    said = job.material.get(body if part == BODY else f"{body}.{part}")
-    return usual if said is None else said.upon(usual)
+    name = body if part == BODY else f"{body}.{part}"
+    said = [material for written, material in job.material.items() if written != name and is_meant(written, name)]
+    for material in [*said, job.material.get(name)]:
+        usual = usual if material is None else material.upon(usual)
+    return usual
+
+
+def is_meant(written: str, name: str) -> bool:
+    """Whether a table of materials, as `ball` or `ball*.spray`, is about a body or a part of one."""
+    (owner, _, part), (body, _, its_part) = written.partition("."), name.partition(".")
+    return fnmatchcase(body, owner) and fnmatchcase(its_part, part)
 
 
 def _usual_material(job: Job, name: str, part: str) -> MaterialParameters:

@@ -1,6 +1,6 @@
 """The job file's schema: the scene's physics, and what is made of it."""
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -28,6 +28,7 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 class Job(SceneParameters):
     """One film: what happens in it, and how it is shown."""
 
+    version: Literal[1] = Field(default=1, description="Version of the job file's keys [-]; this program knows 1.")
     name: str = Field(pattern=NAME_PATTERN, description="Name of the job and of its folder under renders/.")
     fps: Annotated[int, Field(ge=1, le=1000)] = Field(default=60, description="Frames per second [1/s].")
     frames: Annotated[int, Field(ge=1, le=MAX_FRAMES)] | None = Field(
@@ -49,7 +50,8 @@ class Job(SceneParameters):
     volume: VolumeParameters = Field(default=VolumeParameters(), description="Smoke volumes.")
     material: dict[str, MaterialParameters] = Field(
         default_factory=dict,
-        description='What each body looks like, by its name: [material.duck]; a part of one: [material."duck.bill"].',
+        description='What each body looks like, by its name: [material.duck]; a part of one: [material."duck.bill"]; '
+        'several at once: [material."ball*"], of which [material.ball7] may differ.',
     )
     set: SetParameters = Field(default=SetParameters(), description="The set: ground, background and their lights.")
     light: tuple[LightParameters, ...] = Field(default=(), description="Extra lights.")

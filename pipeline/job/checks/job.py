@@ -11,7 +11,7 @@ from pipeline.kinds.base import Kind
 from pipeline.kinds.checks.memory_budget import MemoryBudget, memory_budget
 from pipeline.kinds.checks.shapes import build_solids, in_scale
 from pipeline.kinds.rigid import RIGID
-from pipeline.kinds.table import KINDS, bodies, described_material, placements
+from pipeline.kinds.table import KINDS, bodies, described_material, is_meant, placements
 from pipeline.model.boxes import simulated_regions
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, WHITEWATER
@@ -83,27 +83,35 @@ def _check_materials(job: Job, findings: Findings) -> None:
     for _, kind, body in bodies(job):
         unused = {BODY} if body.name in job.whitewater else {BODY, *WHITEWATER}
         kinds |= {f"{body.name}.{part}": kind for part in kind.material(body) if part not in unused}
-    for name, said in job.material.items():
-        path: KeyPath = ("material", name)
-        owner, _, part = name.partition(".")
-        material = described_material(job, owner, part or BODY) if name in kinds else said
+    for written, said in job.material.items():
+        path: KeyPath = ("material", written)
+        meant = [name for name in kinds if is_meant(written, name)]
         if said.blend is not None:
-            check_blend(said, path, kinds.get(name), findings)
-        elif material.blend is not None:
-            check_keys_beside_blend(said, path, findings)
-        if name not in kinds:
-            findings.error(path, unknown_name(name, kinds, "body", plural="bodies"))
-        elif material.look is not None:
-            _check_wearer(material.look, kinds[name], name, findings)
-        if material.look is not None:
-            _check_keys(material, path, findings)
-            if LOOK_TABLE[material.look].glows:
-                _check_glow(job, name, material.look, findings)
+            check_blend(said, path, kinds[meant[0]] if meant else None, findings)
+        if not meant:
+            findings.error(path, unknown_name(written, kinds, "body", plural="bodies"))
+        for name in meant:
+            owner, _, part = name.partition(".")
+            material = described_material(job, owner, part or BODY)
+            if said.blend is None and material.blend is not None:
+                check_keys_beside_blend(said, path, findings)
+            elif material.look is not None:
+                _check_look(job, material, path, name, kinds[name], findings=findings)
 
 
-def _check_wearer(look: str, kind: Kind, name: str, findings: Findings) -> None:
+def _check_look(
+    job: Job, material: MaterialParameters, path: KeyPath, name: str, kind: Kind, *, findings: Findings
+) -> None:
+    assert material.look is not None
+    _check_wearer(material.look, path, kind, name, findings)
+    _check_keys(material, path, findings)
+    if LOOK_TABLE[material.look].glows:
+        _check_glow(job, path, name, material.look, findings)
+
+
+def _check_wearer(look: str, table: KeyPath, kind: Kind, name: str, findings: Findings) -> None:
     """Note a look that a kind of body cannot have, or whose texture has nothing there to hang on."""
-    path, row = ("material", name, "look"), LOOK_TABLE[look]
+    path, row = (*table, "look"), LOOK_TABLE[look]
     if kind.wears not in row.bodies and kind.wears == "smoke":
         findings.error(path, f'{kind.name} can only look like {quoted_list(looks_for(kind.wears))}, got "{look}"')
     elif kind.wears not in row.bodies:
@@ -121,11 +129,11 @@ def _check_keys(material: MaterialParameters, path: KeyPath, findings: Findings)
             findings.warn((*path, key), f'has no effect on the look "{material.look}"')
 
 
-def _check_glow(job: Job, name: str, look: str, findings: Findings) -> None:
+def _check_glow(job: Job, table: KeyPath, name: str, look: str, findings: Findings) -> None:
     hottest = [source.temperature for smoke in job.smoke if smoke.name == name for source in smoke.source]
     if hottest and max(hottest) < GLOWING_K:
         findings.warn(
-            ("material", name, "look"),
+            (*table, "look"),
             f'is "{look}", but the hottest source has {max(hottest):g} K, and nothing glows below some '
             f"{GLOWING_K:g} K; flames have 1300 K and more",
         )

@@ -120,6 +120,13 @@ def test_a_rule_of_the_whole_job_is_told_of_the_key_that_breaks_it(text, expecte
     assert problems_of(f'name = "dam"\n{text}', tmp_path) == [expected]
 
 
+def test_a_job_file_may_say_the_version_of_its_keys(tmp_path):
+    assert problems_of('name = "dam"\nversion = 2', tmp_path) == ["dam.toml:2 version: expected 1, got 2"]
+    path = tmp_path / "dam.toml"
+    path.write_text('version = 1\nname = "dam"\n')
+    assert load_job(path).version == 1
+
+
 def test_dots_in_texts_and_comments_are_no_depth(tmp_path):
     dots = "." * 100
     comments = f"# {dots} don't\nname = \"dam\" # 'it's {dots}\n"

@@ -70,3 +70,37 @@ def test_a_colour_of_a_part_whose_body_is_of_a_blend_file_is_told_to_have_no_eff
     found = checked(DUCK + tables, tmp_path / "pond.toml")
     assert found.errors == []
     assert any("duck.bill" in line and "color: has no effect beside blend" in line for line in found.warnings)
+
+
+MANY = (
+    DUCK
+    + """
+[[rigid]]
+name = "ball1"
+shape = { type = "sphere", radius = 0.05 }
+position = [0.2, 0.0, 0.5]
+[[rigid]]
+name = "ball2"
+shape = { type = "sphere", radius = 0.05 }
+position = [0.4, 0.0, 0.5]
+"""
+)
+
+
+def test_one_table_is_about_many_bodies_of_which_one_may_differ(tmp_path):
+    tables = '[material.ball2]\ncolor = [0.9, 0.1, 0.1]\n[material."ball*"]\nlook = "metal"\ncolor = [0.5, 0.5, 0.5]\n'
+    assert checked(MANY + tables, tmp_path / "pond.toml").errors == []
+    balls = load_job(tmp_path / "pond.toml")
+    assert material_of(balls, "ball1").look == material_of(balls, "ball2").look == "metal"
+    assert (material_of(balls, "ball1").color, material_of(balls, "ball2").color) == ((0.5,) * 3, (0.9, 0.1, 0.1))
+    assert material_of(balls, "duck") == NATURAL["body"]
+
+
+def test_a_table_of_many_is_not_about_parts_and_is_told_where_it_does_not_fit(tmp_path):
+    tables = '[material."*"]\nlook = "smoke"\n[material."b*x"]\nlook = "glass"\n'
+    found = checked(MANY + tables, tmp_path / "pond.toml")
+    assert any('material."*".look: ' in each and '"flag"' in each for each in found.errors), found.errors
+    assert any('material."b*x": no body is named "b*x"' in each for each in found.errors)
+    (tmp_path / "duck.toml").write_text(MANY + '[material."d*"]\nlook = "plastic"\n')
+    duck = load_job(tmp_path / "duck.toml")
+    assert material_of(duck, "duck", "bill") == NATURAL["bill"]
