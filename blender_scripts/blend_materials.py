@@ -19,7 +19,8 @@ from typing import Any
 
 if __package__ in (None, ""):
     # Run as a script: the package is not on the path.
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    # Last: where the program is installed, that folder holds packages of another Python than Blender's as well.
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 import bpy
 

@@ -22,7 +22,8 @@ from typing import Any, NoReturn, TextIO
 
 if __package__ in (None, ""):
     # Run by a Blender executable: the package is not on its path.
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    # Last: where the program is installed, that folder holds packages of another Python than Blender's as well.
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 import bpy
 

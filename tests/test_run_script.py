@@ -13,9 +13,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from places import PROJECT
-
-UV = shutil.which("uv") or next(PROJECT.glob(".tools/uv/bin/uv"), None)
+from places import PROJECT, UV
 
 pytestmark = pytest.mark.skipif(UV is None, reason="uv is neither on PATH nor in .tools; ./run would fetch it")
 

@@ -3,6 +3,8 @@
 import re
 import subprocess
 import sys
+import tomllib
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -73,12 +75,11 @@ def test_lock_pins_every_package_with_hashes_and_names_no_host():
 
 
 def test_every_direct_requirement_is_locked():
-    names = {
-        re.match(r"[A-Za-z0-9._-]+", line).group().lower()
-        for file in ("requirements.in", "requirements-dev.in")
-        for line in (PROJECT / file).read_text(encoding="utf-8").splitlines()
-        if line and not line.startswith("#")
-    }
+    settings = tomllib.loads((PROJECT / "pyproject.toml").read_text(encoding="utf-8"))
+    project = settings["project"]
+    extras = project["optional-dependencies"].values()
+    lines = [*project["dependencies"], *chain(*extras), *settings["dependency-groups"]["dev"]]
+    names = {re.match(r"[A-Za-z0-9._-]+", line).group().lower() for line in lines}
     locked = set(
         re.findall(r"^([A-Za-z0-9._-]+)==", (PROJECT / "requirements.lock").read_text(encoding="utf-8"), re.MULTILINE)
     )

@@ -97,7 +97,7 @@ def print_report(examinations: Iterable[Examination]) -> None:
     Console().print(table)
 
 
-_SYNC = "run ./run once; it installs requirements.lock"
+_SYNC = "run ./run once, which installs requirements.lock; or install the wheel anew"
 
 
 def _guarded(name: str, look: Callable[[], Iterable[Examination]]) -> list[Examination]:
