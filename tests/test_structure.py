@@ -26,6 +26,7 @@ def modules_after(statement: str) -> set[str]:
         "import pipeline.cli.main",
         "import pipeline.__main__",
         "import pipeline.stages",
+        "from pipeline import Scene, submit",
         "from pipeline.job.loading import load_job",
         "import pipeline.job.schema",
         "import sim.shapes, sim.scene",
@@ -34,6 +35,10 @@ def modules_after(statement: str) -> set[str]:
 )
 def test_import_loads_neither_physics_nor_blender(statement):
     assert modules_after(statement) & HEAVY == set()
+
+
+def test_the_package_by_itself_loads_nothing_of_it():
+    assert {name for name in modules_after("import pipeline") if name.startswith("pipeline.")} == set()
 
 
 def test_help_needs_no_arrays_and_no_tables():

@@ -22,15 +22,12 @@ from pipeline.run.executors.choice import executor_options
 
 if TYPE_CHECKING:
     from pipeline.base.task import Resources
-    from pipeline.job.loading import LoadedJob
     from pipeline.queue.job_queue import JobQueue
 
 DEFAULT_OUTPUT = Path("renders")
 SUFFIX = ".toml"
 
 PRIORITY = click.IntRange(-1000, 1000)
-
-BLENDER_VARIABLE = "PIPELINE_BLENDER"  # names the Blender that job files may name, too
 
 
 cores_option = click.option(
@@ -96,51 +93,6 @@ def target_option(meaning: str, *, required: bool = False) -> Callable[[Any], An
     """Where to write a file."""
     path = click.Path(path_type=Path, dir_okay=False)
     return click.option("-o", "--to", "target", type=path, required=required, help=f"Where to write it{meaning}.")
-
-
-def read_own_job(job_file: Path, overrides: Sequence[str], *, preview: bool, until: Sequence[str] = ()) -> LoadedJob:
-    """A job file that names no program but the user's own.
-
-    Raises JobFileError with every problem; if keys or values are wrong, with those of the scene that is left, too.
-    """
-    from pipeline.job.loading import InvalidJobError, read_job
-    from pipeline.run.checked_job import with_findings
-
-    try:
-        loaded = read_job(job_file, overrides, preview=preview)
-    except InvalidJobError as error:
-        raise with_findings(error, until) from None
-    require_own_programs(loaded, overrides)
-    return loaded
-
-
-def require_own_programs(loaded: LoadedJob, overrides: Sequence[str]) -> None:
-    """Refuse (JobFileError) a job file that names a program to be run: whose file it is does not decide what runs here.
-
-    The user names it with `--set`, or in the environment. A job's folder keeps what its user has named.
-    """
-    program = loaded.job.render.blender
-    if program is None or any(override.replace(" ", "").startswith("render.blender=") for override in overrides):
-        return
-    if loaded.path.name == "job.toml" and JobLayout(loaded.path.parent).manifest.exists():
-        return
-    if os.environ.get(BLENDER_VARIABLE) != program:
-        raise JobFileError(
-            [
-                f"{loaded.path.name}: render.blender names a program, and a job file may not choose what runs here; "
-                f"if you trust it: --set render.blender={shlex.quote(program)}"
-            ]
-        )
-
-
-def require_plannable(loaded: LoadedJob) -> None:
-    """Refuse (JobFileError) numbers that planning would overflow with, before the whole scene is looked at."""
-    from pipeline.job.magnitudes import check_magnitudes
-    from pipeline.model.problems import Findings
-
-    findings = Findings()
-    if not check_magnitudes(loaded.job, findings):
-        raise JobFileError(loaded.source.describe_all(findings.errors))
 
 
 def submission_folder(job_file: Path, name: str, output: Path, *, is_changed: bool) -> JobLayout:

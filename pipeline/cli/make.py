@@ -21,13 +21,12 @@ from pipeline.cli.arguments import (
     parse_frames,
     place,
     queue_options,
-    read_own_job,
-    require_plannable,
     submission_folder,
     submitted_job_argument,
     until_option,
 )
-from pipeline.queue.submitting import QueueOptions, is_finished, look_at, run, say_what_it_takes, stages_to_run
+from pipeline.queue.submitting import QueueOptions, run
+from pipeline.queue.submitting import submit as submit_to_queue
 
 if TYPE_CHECKING:
     from pipeline.run.plan import Assessment
@@ -65,10 +64,9 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
     """
     from pipeline.kinds.table import KINDS
     from pipeline.model.problems import format_path
-    from pipeline.run.checked_job import load_checked_job, needs_pictures
+    from pipeline.run.checked_job import checked, needs_pictures, read_own_job
 
-    read_own_job(job_file, overrides, preview=preview, until=until)
-    loaded, findings = load_checked_job(job_file, overrides, preview=preview, until=until)
+    loaded, findings = checked(read_own_job(job_file, overrides, preview=preview, until=until), until)
     print_warnings(loaded.warnings)
     if as_json:
         click.echo(loaded.job.model_dump_json(indent=2))
@@ -104,11 +102,10 @@ def plan(
     pipeline plan dam.toml --set 'camera.position=[0, -3, 1]'
     """
     from pipeline.run.assessment import assess_job
-    from pipeline.run.checked_job import load_checked_job
+    from pipeline.run.checked_job import checked, read_own_job
     from pipeline.run.plan import Verdict, estimate, summarize
 
-    read_own_job(job_file, overrides, preview=preview, until=until)
-    loaded, _ = load_checked_job(job_file, overrides, preview=preview, until=until)
+    loaded, _ = checked(read_own_job(job_file, overrides, preview=preview, until=until), until)
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     assessments, estimates, _ = assess_job(loaded.job, layout, until)
     if as_json:
@@ -156,29 +153,13 @@ def submit(
     pipeline submit dam.toml --output /shared/renders --scheduler tcp://farm:8786
     """
     from pipeline.record.interrupted_recording import complete_interrupted_recording
+    from pipeline.run.checked_job import read_own_job
 
     if job_file.name == "job.toml" and (sentence := complete_interrupted_recording(JobLayout(job_file.parent))):
         click.echo(sentence, err=True)
     loaded = read_own_job(job_file, overrides, preview=preview, until=until)
-    require_plannable(loaded)
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
-    state = look_at(loaded.job, layout, until)
-    todo = stages_to_run(state)
-    if todo:
-        # Checking the scene builds its shapes, which takes longer than finding out that there is nothing to do.
-        from pipeline.queue.disk import size_of
-        from pipeline.run.checked_job import load_checked_job
-
-        loaded, findings = load_checked_job(job_file, overrides, preview=preview, until=until)
-        print_warnings(loaded.warnings)
-        if state is not None:
-            say_what_it_takes(state, size_of(loaded.job, findings), layout, options.reserve_bytes)
-    if is_finished(state, layout, loaded.text, until):
-        from pipeline.queue.endings import say_finished
-
-        say_finished(layout)
-        return
-    sys.exit(run(loaded.job, layout, todo, submitted=loaded, options=options, until=until))
+    sys.exit(submit_to_queue(loaded, layout, options=options, until=until))
 
 
 @click.command()
@@ -264,14 +245,13 @@ def openjd(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
     from pipeline.base.lease import refuse_if_held
     from pipeline.base.places import check_places
     from pipeline.job.inputs import keep_inputs
-    from pipeline.run.checked_job import load_checked_job
+    from pipeline.run.checked_job import checked, read_own_job
     from pipeline.run.executors.choice import require_named_devices
     from pipeline.run.plan import plan_job
     from pipeline.show.openjd import job_template
     from pipeline.stages import STAGES
 
-    read_own_job(job_file, overrides, preview=preview)
-    loaded, _ = load_checked_job(job_file, overrides, preview=preview)
+    loaded, _ = checked(read_own_job(job_file, overrides, preview=preview))
     require_named_devices(loaded.job, [stage.name for stage in STAGES])
     print_warnings(loaded.warnings)
     layout = JobLayout((output / loaded.job.name).absolute())

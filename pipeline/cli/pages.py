@@ -16,7 +16,6 @@ from pipeline.cli.arguments import (
     job_options,
     output_option,
     parse_size,
-    read_own_job,
     submitted_job_argument,
 )
 
@@ -111,7 +110,7 @@ def live(
     pipeline live dam.toml --preview --port 0
     """
     from pipeline.base.resources import machine_capacity
-    from pipeline.run.checked_job import load_checked_job
+    from pipeline.run.checked_job import load_checked_job, read_own_job
     from pipeline.web.live.admission import computing_power, fluent, live_job, require_small, told_changes
     from pipeline.web.live.parameters import parameters_of
     from pipeline.web.live.soundness import LONGEST_FRAME_S

@@ -21,7 +21,6 @@ from pipeline.cli.arguments import (
     find_job,
     output_option,
     overrides_option,
-    require_own_programs,
     submitted_job_argument,
     target_option,
 )
@@ -83,6 +82,7 @@ def still(
         _write_sheet(find_job(job, output), target, pictures=pictures, columns=columns)
         return
     from pipeline.job.loading import read_job
+    from pipeline.run.checked_job import require_own_programs
     from pipeline.show.stills import make_still, survey
 
     layout = JobLayout(find_job(job, output).root.absolute())
@@ -201,6 +201,7 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
     """
     from pipeline.base.lease import refuse_if_held
     from pipeline.job.loading import read_job
+    from pipeline.run.checked_job import require_own_programs
     from pipeline.run.single_stage import run_tasks
     from pipeline.show.animatic import drawable_frames, made_before, make_animatic
     from pipeline.show.stills import survey

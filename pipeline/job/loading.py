@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tomlkit
+from tomlkit.exceptions import ConvertError
+
 from pipeline.base.errors import JobFileError
 from pipeline.base.layout import JobLayout
 from pipeline.job.input_files import InputFile, input_files
@@ -75,9 +78,41 @@ def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
     Raises JobFileError: carries every problem found.
     """
     path = Path(path)
-    text = _read_text(path)
+    return _load(path, _read_text(path), overrides, preview=preview)
+
+
+def make_job(**tables: Any) -> LoadedJob:
+    """A job of keyword arguments that are called like the keys and tables of the job file.
+
+    Tables are dicts, several of one name a list of them; arrays, tuples and paths may be given, and None is a key left
+    out. Relative files are of the working folder.
+
+    Raises JobFileError: carries every problem found.
+    """
+    try:
+        text = tomlkit.dumps(_as_toml(tables))
+    except ConvertError as error:
+        raise JobFileError([f"make_job: no job file can hold that: {error}"]) from None
+    return _load(Path("make_job"), text, (), preview=False, source=JobSource("make_job", ""))
+
+
+def _as_toml(value: Any) -> Any:
+    """A value of Python and numpy as TOML has it."""
+    if isinstance(value, Mapping):
+        return {str(key): _as_toml(child) for key, child in value.items() if child is not None}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_as_toml(child) for child in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _load(
+    path: Path, text: str, overrides: Sequence[str], *, preview: bool, source: JobSource | None = None
+) -> LoadedJob:
+    """The job of a text; `source` has the places of its keys, those in the text if omitted."""
     changes = _parse_overrides(overrides, _parse(path, text)) if overrides else []
-    source = JobSource(path.name, text, {change.path: change.origin for change in changes})
+    source = source or JobSource(path.name, text, {change.path: change.origin for change in changes})
     if changes:
         text = changed_text(text, changes)
     job, text = _with_absolute_files(_job_of(path, text, source), text, path)

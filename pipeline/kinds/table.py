@@ -3,10 +3,12 @@
 A new kind of body is a module beside this one and a row here; see docs/architecture.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, create_model
 
@@ -32,6 +34,9 @@ from render.spec import (
 )
 from sim.scene import SceneParameters
 from sim.shapes.parameters import Placement
+
+if TYPE_CHECKING:
+    from sim.core.world import World
 
 KINDS: dict[str, Kind] = {kind.name: kind for kind in (RIGID, FLUID, CLOTH, SMOKE)}
 """Every kind by its name, in the order in which a job's bodies are listed."""
@@ -72,6 +77,15 @@ def bodies(job: SceneParameters) -> Iterator[tuple[KeyPath, Kind, Any]]:
 def body_names(job: SceneParameters) -> list[str]:
     """Names of all bodies."""
     return [body.name for _, _, body in bodies(job)]
+
+
+def world_of(job: Job) -> World:
+    """The world of a job in its initial state, with the solvers of all kinds; as of `sim.build.build_world`."""
+    from sim.build import build_world
+
+    makers = [kind.solvers for kind in KINDS.values() if kind.solvers is not None]
+    more = [solver for make in makers for solver in make(job, job.fps)]
+    return build_world(job, frames_per_second=job.fps, solvers=more)
 
 
 def placements(job: Job) -> Iterator[tuple[KeyPath, Placement]]:

@@ -61,6 +61,32 @@ class QueueOptions:
         return ExecutorChoice.of(self.executor, self.scheduler, self.workers)
 
 
+def submit(loaded: LoadedJob, layout: JobLayout, *, options: QueueOptions, until: Sequence[str] = ()) -> int:
+    """Check a job that was read, and run it in its folder as far as that is not done; returns the exit code.
+
+    Raises JobFileError with every problem, and as `run`.
+    """
+    from pipeline.run.checked_job import checked, require_plannable
+
+    require_plannable(loaded)
+    state = look_at(loaded.job, layout, until)
+    todo = stages_to_run(state)
+    if todo:
+        # Checking the scene builds its shapes, which takes longer than finding out that there is nothing to do.
+        from pipeline.queue.disk import size_of
+
+        loaded, findings = checked(loaded, until)
+        print_warnings(loaded.warnings)
+        if state is not None:
+            _say_what_it_takes(state, size_of(loaded.job, findings), layout, options.reserve_bytes)
+    if is_finished(state, layout, loaded.text, until):
+        from pipeline.queue.endings import say_finished
+
+        say_finished(layout)
+        return 0
+    return run(loaded.job, layout, todo, submitted=loaded, options=options, until=until)
+
+
 def run(
     job: Job,
     layout: JobLayout,
@@ -176,7 +202,7 @@ def is_finished(state: JobAssessment | None, layout: JobLayout, text: str | None
     )
 
 
-def say_what_it_takes(state: JobAssessment, size: Size, layout: JobLayout, reserve_bytes: int | None) -> None:
+def _say_what_it_takes(state: JobAssessment, size: Size, layout: JobLayout, reserve_bytes: int | None) -> None:
     """Say how much a job will write, about, and warn if the disk has no room for it."""
     from pipeline.queue import disk
 

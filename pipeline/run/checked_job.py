@@ -1,12 +1,16 @@
 """The check of a job before any work: what its file describes, and what its stages can do here."""
 
+import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from pipeline.base.errors import JobFileError
+from pipeline.base.layout import JobLayout
 from pipeline.job.checks.job import check_description
 from pipeline.job.loading import InvalidJobError, LoadedJob, read_job
+from pipeline.job.magnitudes import check_magnitudes
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings, Problem, suggestion
 from pipeline.stages import STAGES
@@ -15,6 +19,9 @@ from pipeline.stages.render import RenderStage
 
 PICTURE_KEYS = frozenset({"camera", "light", "set", "material", "render", "movie"})
 """Tables of the job file that decide nothing but pictures."""
+
+BLENDER_VARIABLE = "PIPELINE_BLENDER"
+"""Names the Blender that job files may name, too."""
 
 
 def needs_pictures(until: Sequence[str]) -> bool:
@@ -60,6 +67,45 @@ def _check_limits(job: Job, findings: Findings) -> None:
             )
 
 
+def read_own_job(path: Path | str, overrides: Sequence[str], *, preview: bool, until: Sequence[str] = ()) -> LoadedJob:
+    """A job file that names no program but the user's own.
+
+    Raises JobFileError with every problem; if keys or values are wrong, with those of the scene that is left, too.
+    """
+    try:
+        loaded = read_job(path, overrides, preview=preview)
+    except InvalidJobError as error:
+        raise with_findings(error, until) from None
+    require_own_programs(loaded, overrides)
+    return loaded
+
+
+def require_own_programs(loaded: LoadedJob, overrides: Sequence[str]) -> None:
+    """Refuse (JobFileError) a job file that names a program to be run: whose file it is does not decide what runs here.
+
+    The user names it with `--set`, or in the environment. A job's folder keeps what its user has named.
+    """
+    program = loaded.job.render.blender
+    if program is None or any(override.replace(" ", "").startswith("render.blender=") for override in overrides):
+        return
+    if loaded.path.name == "job.toml" and JobLayout(loaded.path.parent).manifest.exists():
+        return
+    if os.environ.get(BLENDER_VARIABLE) != program:
+        raise JobFileError(
+            [
+                f"{loaded.path.name}: render.blender names a program, and a job file may not choose what runs here; "
+                f"if you trust it: --set render.blender={shlex.quote(program)}"
+            ]
+        )
+
+
+def require_plannable(loaded: LoadedJob) -> None:
+    """Refuse (JobFileError) numbers that planning would overflow with, before the whole scene is looked at."""
+    findings = Findings()
+    if not check_magnitudes(loaded.job, findings):
+        raise JobFileError(loaded.source.describe_all(findings.errors))
+
+
 def load_checked_job(
     path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False, until: Sequence[str] = ()
 ) -> tuple[LoadedJob, Findings]:
@@ -68,6 +114,11 @@ def load_checked_job(
         loaded = read_job(path, overrides, preview=preview)
     except InvalidJobError as error:
         raise with_findings(error, until) from None
+    return checked(loaded, until)
+
+
+def checked(loaded: LoadedJob, until: Sequence[str] = ()) -> tuple[LoadedJob, Findings]:
+    """A job that was read, with its warnings, and what was found of it. Raises JobFileError with every problem."""
     findings = check_job(loaded.job, until=until)
     if findings.errors:
         raise JobFileError(loaded.source.describe_all(findings.errors))

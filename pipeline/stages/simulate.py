@@ -19,7 +19,7 @@ from pipeline.base.files import make_folder, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
-from pipeline.kinds.table import KINDS, bodies
+from pipeline.kinds.table import KINDS, bodies, world_of
 from pipeline.model.job import Job
 from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.inputs import by_content
@@ -37,7 +37,7 @@ from pipeline.store.receipts import read_receipt
 from sim.core.launch import on_compiled
 from sim.core.runtime import DeviceUnavailableError, initialize, resolve_device
 from sim.core.snapshots import Snapshot
-from sim.core.world import FrameReport, World
+from sim.core.world import FrameReport
 from sim.scene import SceneParameters
 
 CHECKPOINT_INTERVAL_S = 30.0
@@ -137,16 +137,12 @@ class _Simulation:
     """One attempt at the simulation of a job."""
 
     def __init__(self, context: TaskContext) -> None:
-        from sim.build import build_world
-
         self._context = context
         on_compiled(self._tell_compiling)
         self._folder = context.layout.checkpoints
         make_folder(self._folder, within=context.layout.root)
         self._device = initialize(context.job.device, threads=context.threads, gpu=context.gpu)
-        more = (kind.solvers for kind in KINDS.values() if kind.solvers is not None)
-        solvers = [solver for make in more for solver in make(context.job, context.job.fps)]
-        self._world: World = build_world(context.job, frames_per_second=context.job.fps, solvers=solvers)
+        self._world = world_of(context.job)
         self._checkpointed_at = time.monotonic()
         self._last_checkpoint = -1
 

@@ -36,6 +36,7 @@ from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
+from sim.core.host_access import add, viewed
 from sim.core.parameters import Vector3
 from sim.core.scheduling import is_short
 from sim.core.snapshots import Snapshot
@@ -377,6 +378,21 @@ class ClothSolver:
             }
             snapshots[cloth.name] = Snapshot("cloth", arrays, {"thickness": cloth.thickness})
         return snapshots
+
+    def view(self, body: str) -> dict[str, NDArray[np.generic]]:
+        """Positions [m] and velocities [m/s] of a cloth's nodes, in the solver's memory on a CPU."""
+        rows = self._rows_of(body)
+        return {name: viewed(getattr(self.state, name))[rows] for name in ("position", "velocity")}
+
+    def push(self, body: str, change: NDArray[np.floating]) -> None:
+        """Change the velocities of a cloth's nodes by (n, 3) or (3,) [m/s]; those that pins hold keep theirs."""
+        rows = self._rows_of(body)
+        is_free = viewed(self.state.inverse_mass)[rows, None] > 0.0
+        add(self.state.velocity, rows, np.where(is_free, change, 0.0))
+
+    def _rows_of(self, body: str) -> slice:
+        first, last = self.state.host.first_node[self.state.names.index(body) :][:2]
+        return slice(int(first), int(last))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Where nodes are and how they move; the time, how many sweeps steps take, how they are divided and why."""

@@ -39,15 +39,29 @@ def take(array: ti.Ndarray) -> NDArray[np.generic]:
     return values
 
 
+def viewed(array: ti.Ndarray) -> NDArray[np.generic]:
+    """The numbers of an array: its own memory on a CPU, a copy elsewhere."""
+    return array.to_numpy() if runs_on_gpu() else _memory(array)
+
+
+def add(array: ti.Ndarray, rows: slice | NDArray[np.integer], change: NDArray[np.floating]) -> None:
+    """Add to rows of an array."""
+    values = viewed(array)
+    values[rows] += change.astype(values.dtype)
+    if runs_on_gpu():
+        array.from_numpy(values)
+
+
 def copied(array: ti.Ndarray) -> NDArray[np.generic]:
     """The numbers of an array, vectors and matrices along the last axes."""
     return array.to_numpy() if runs_on_gpu() else _memory(array).copy()
 
 
 def _memory(array: ti.Ndarray) -> NDArray[np.generic]:
-    """The memory of an array on a CPU, not to be kept: it goes with the array."""
+    """The memory of an array on a CPU, which stays as long as it is looked at; what it holds may be anything later."""
     kind = np.dtype(to_numpy_type(array.dtype))
     shape = (*array.shape, *array.element_shape)
     address = impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr)
     memory = (ctypes.c_char * (math.prod(shape) * kind.itemsize)).from_address(address)
+    memory.owner = array  # type: ignore[attr-defined]
     return np.frombuffer(memory, dtype=kind).reshape(shape)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,22 @@ class Solver(Protocol):
 
     def first_bad_quantity(self) -> str | None:
         """The first non-finite or runaway quantity of the state, in words, or None."""
+
+
+@runtime_checkable
+class HasViews(Protocol):
+    """A solver whose state others may look at between substeps."""
+
+    def view(self, body: str) -> dict[str, NDArray[np.generic]]:
+        """Arrays of a body now, good until the next substep: the solver's own memory on a CPU, where that has them."""
+
+
+@runtime_checkable
+class TakesPushes(HasViews, Protocol):
+    """A solver whose bodies others may push between substeps."""
+
+    def push(self, body: str, change: NDArray[np.floating]) -> None:
+        """Change the velocity of what is free to move, in the order of `view`, by (n, 3) or (3,) [m/s]."""
 
 
 class Coupling:

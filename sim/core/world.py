@@ -45,6 +45,8 @@ class World:
         max_substeps_per_frame: a frame that needs more counts as diverged; may be changed between frames.
         watch: asked after every substep what is wrong with the frame, which counts as diverged then; may be None.
             What it raises leaves the frame half done: only `restore` goes on from there.
+        before_substep: called with a solver's name and the length [s] of its substep right before that, as an external
+            force is; may be None.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class World:
         self.frame = 0
         self.max_substeps_per_frame = MAX_SUBSTEPS_PER_FRAME
         self.watch: Callable[[], str | None] | None = None
+        self.before_substep: Callable[[str, float], None] | None = None
         self._frames_per_second = frames_per_second
         self._solvers = {solver.name: solver for solver in solvers}
         self._couplings = tuple(couplings)
@@ -144,7 +147,7 @@ class World:
             dt = remaining / left
             if team.ahead is not None:
                 self._advance_team(team.ahead, dt, elapsed_s)
-            team.substep(dt)
+            team.substep(dt, self.before_substep)
             remaining = remaining - dt if left > 1 else 0.0
             if (finding := self.watch and self.watch()) is not None:
                 raise self._divergence(team.names, start_s + (duration_s - remaining), finding)
@@ -185,11 +188,13 @@ class _Team:
     def begin_frame(self) -> None:
         self.taken, self.smallest_dt_s = 0, math.inf  # substeps in this frame, and the smallest of them [s]
 
-    def substep(self, dt: float) -> None:
+    def substep(self, dt: float, before: Callable[[str, float], None] | None) -> None:
         for solver in self.solvers:
             for coupling in self.couplings:
                 if coupling.bodies[1] == solver.name:
                     coupling.exchange(dt)
+            if before is not None:
+                before(solver.name, dt)
             solver.substep(dt)
         for coupling in self.couplings:
             coupling.follow(dt)

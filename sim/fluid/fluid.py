@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import taichi as ti
 
+from sim.core.host_access import add, viewed
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Remedies
 from sim.fluid.expected_speed import expected_speed
@@ -165,6 +166,24 @@ class SPHFluid(ABC):
             attributes = {"particle_radius": fluid.particle_radius, "rest_density": fluid.rest_density}
             snapshots[fluid.name] = Snapshot(kind="fluid", arrays=own, attributes=attributes)
         return snapshots
+
+    def view(self, body: str) -> dict[str, NDArray[np.generic]]:
+        """Positions [m], velocities [m/s] and ids of a fluid's particles, sorted as the solver has them.
+
+        A fluid that is alone in its tank is seen in the solver's memory on a CPU; of several each gets copies.
+        """
+        rows, arrays = self._rows_of(body), self.particles.arrays
+        return {name: viewed(getattr(arrays, name))[rows] for name in ("position", "velocity", "particle_id")}
+
+    def push(self, body: str, change: NDArray[np.floating]) -> None:
+        """Change the velocities of a fluid's particles by (n, 3) in the order of `view`, or (3,) [m/s]."""
+        add(self.particles.velocity, self._rows_of(body), change)
+
+    def _rows_of(self, body: str) -> slice | NDArray[np.int64]:
+        number = self.phases.names.index(body)
+        if len(self.phases) == 1:
+            return slice(self.particle_count)
+        return np.flatnonzero(viewed(self.particles.arrays.phase)[: self.particle_count] == number)
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The state of the tank, of which the solver's own part is the carried scalars."""

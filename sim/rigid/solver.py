@@ -307,6 +307,23 @@ class RigidSolver:
             snapshots[name] = Snapshot("rigid", arrays, {})
         return snapshots
 
+    def view(self, body: str) -> dict[str, NDArray[np.generic]]:
+        """Pose and velocities of a body, as in its snapshot: copies, of 13 numbers."""
+        return dict(self.snapshots()[body].arrays)
+
+    def push(self, body: str, change: NDArray[np.floating]) -> None:
+        """Change the velocity of a dynamic body's centre of mass by (3,) [m/s], as a force does that turns nothing.
+
+        Raises:
+            ValueError: the body is led by keyframes.
+        """
+        number = self.bodies.names.index(body)
+        if not self.bodies.is_dynamic[number]:
+            raise ValueError(f'"{body}" is kinematic: it goes where its keyframes lead it, and no force moves it')
+        linear = np.zeros((len(self.bodies), 3))
+        linear[number] = self.bodies.mass[number] * change
+        self.bodies.apply_impulses(linear, np.zeros_like(linear))
+
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Poses, velocities, the clock, and the impulses that the next contacts start from."""
         return {

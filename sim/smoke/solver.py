@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats
 from sim.core.domain import DomainParameters
+from sim.core.host_access import viewed
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
@@ -188,6 +189,16 @@ class SmokeSolver:
             "ambient_temperature": self.parameters.ambient_temperature,
         }
         return {self.name: Snapshot("smoke", arrays, attributes)}
+
+    def view(self, body: str) -> dict[str, NDArray[np.generic]]:  # noqa: ARG002  a solver has one smoke
+        """Density [-] and temperature above the air's [K] of the cells, in the solver's memory on a CPU.
+
+        Cells in solids hold what is continued into them.
+        """
+        arrays = self._arrays
+        return {
+            name: self.grid.trim(viewed(arrays[name]), self.grid.cells) for name in ("density", "excess_temperature")
+        }
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The state with its ghosts, the obstacles that move, the time and the counted masses."""

@@ -210,9 +210,9 @@ def fuzz(seed: int, count: int, folder: Path, *, first: int = 0, scenes: float =
     """
     from pipeline.base.errors import PipelineError
     from pipeline.base.layout import JobLayout
-    from pipeline.cli.arguments import require_own_programs, require_plannable
     from pipeline.cli.main import main as command_line
     from pipeline.job.loading import read_job
+    from pipeline.run.checked_job import require_own_programs, require_plannable
     from pipeline.run.plan import plan_job
     from pipeline.stages import STAGES
 
