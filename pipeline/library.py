@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -231,7 +233,7 @@ def submit(
 ) -> Submission:
     """Submit a job as `pipeline submit --detach`: it runs in processes of its own, and goes on without this one.
 
-    Submitted again, it continues; what is done is not done twice.
+    Submitted again, it continues; what is done is not done twice. What the command prints goes to standard error.
 
     Args:
         job: of `make_job` or `read_job`.
@@ -244,5 +246,6 @@ def submit(
         PipelineError: the folder cannot be written to, or a stage cannot run on this machine.
     """
     layout = JobLayout(Path(output).absolute() / job.job.name)
-    submit_to_queue(job, layout, options=QueueOptions(detach=True, cores=cores), until=tuple(until))
+    with redirect_stdout(sys.stderr):
+        submit_to_queue(job, layout, options=QueueOptions(detach=True, cores=cores), until=tuple(until))
     return Submission(job, layout.root)
