@@ -200,7 +200,7 @@ def write_page(page: Path, sections: Mapping[str, str]) -> None:
     """All sections under one head, in the order of their names."""
     head = """# Gallery
 
-The jobs of [jobs/](../../jobs), one after the other. Each can be made with `pipeline submit jobs/NAME.toml`. A section
+The jobs of `jobs/`, one after the other. Each can be made with `pipeline submit jobs/NAME.toml`. A section
 says what it was drawn on, and stays until its job is drawn again. Seconds are what a stage's tasks took beside all
 others; what a frame takes alone is in [rendering](rendering.md#quality-presets). Where not all frames are drawn, they
 are from all over what was simulated. Written by `python -m benchmarks.gallery`.

@@ -31,8 +31,10 @@ from sim.core.world import FrameReport
 
 __all__ = ["Scene", "Submission", "make_job", "read_frame", "read_job", "submit"]
 
-Force = Callable[[Mapping[str, NDArray[Any]], float], ArrayLike]
-"""Force per mass [m/s²] on a body, of its arrays and the time [s]: (n, 3) in the order of the arrays, or (3,)."""
+Acting = Callable[[Mapping[str, NDArray[Any]], float], ArrayLike]
+Force = Acting | ArrayLike
+"""Force per mass [m/s²] on a body: (3,), or a function of its arrays and the time [s] that returns (3,), or (n, 3) in
+the order of the arrays."""
 
 
 def read_job(path: Path | str, *changes: str, preview: bool = False) -> LoadedJob:
@@ -74,7 +76,7 @@ class Scene:
         self.device = initialize(self.job.device, threads=threads)
         self.world = world_of(self.job)
         self.report = FrameReport(0, 0.0, {}, {}, self.world.diagnostics())
-        self._forces: list[tuple[str, str, Force]] = []  # the solver's name, the body's, the force
+        self._forces: list[tuple[str, str, Acting]] = []  # the solver's name, the body's, the force
 
     @property
     def frame(self) -> int:
@@ -128,7 +130,7 @@ class Scene:
             return arrays
         raise ValueError(f'the solver of "{body}" has no views; bodies() has its arrays, copied')
 
-    def add_force(self, body: str, force: Force | ArrayLike) -> None:
+    def add_force(self, body: str, force: Force) -> None:
         """Let a force act on a fluid, a cloth or a dynamic rigid body from now on, beside all that act already.
 
         Before each substep of dt [s] velocities change by dt times the force per mass at that moment, to first order in
@@ -190,7 +192,7 @@ class Submission:
 
     job: LoadedJob
     folder: Path
-    """The job's folder: cache, surfaces, frames, film."""
+    """The job's folder, with cache, surfaces, frames and film."""
 
     @property
     def film(self) -> Path:

@@ -5,6 +5,7 @@
 writes it between the file's two markers; a test asserts that it is current.
 """
 
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -87,7 +88,7 @@ def _section(heading: str, about: str, node: schema.Node) -> Iterator[str]:
         yield from (" ".join(about.split()), "")
     yield "| key | value | default | meaning |"
     yield "|---|---|---|---|"
-    yield from _rows(node)
+    yield from _rows(node, _anchor_of(heading))
     yield ""
     if node.get("title") == _CLOTH:
         yield from _materials_of_cloth()
@@ -105,7 +106,13 @@ def _materials_of_cloth() -> Iterator[str]:
     yield ""
 
 
-def _rows(node: schema.Node) -> Iterator[str]:
+def _anchor_of(heading: str) -> str:
+    """Begins the anchors of a table's keys: "fluid.block.", "cloth.shape.mesh.", "" at the top of the file."""
+    words = re.findall(r"[a-z]\w*", heading) if heading.startswith("[") or "=" in heading else []
+    return "".join(f"{word}." for word in words if word != "type")
+
+
+def _rows(node: schema.Node, anchor: str) -> Iterator[str]:
     required = node.get("required", [])
     for key, property_ in node["properties"].items():
         table, _ = _table_of(key, property_)
@@ -114,7 +121,8 @@ def _rows(node: schema.Node) -> Iterator[str]:
         default = "required" if key in required else _written(property_.get("default"))
         if node.get("title") == _CLOTH and key in MATERIAL_UNITS:
             default = "the material's"
-        cells = (f"`{key}`", _kind(property_), default, property_.get("description", ""))
+        name = f'<a id="{anchor}{key}" href="#{anchor}{key}">`{key}`</a>'
+        cells = (name, _kind(property_), default, property_.get("description", ""))
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 

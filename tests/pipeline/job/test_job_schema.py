@@ -83,8 +83,20 @@ def test_reference_in_the_documentation_is_current():
 
 
 def test_the_reference_has_all_digits_of_bounds_as_messages_do():
-    assert "| `seed` | whole number ≥ 0 and < 2147483648 |" in reference()
-    assert "| `max_particles` | whole number ≥ 1 and ≤ 2147483647 |" in reference()
+    assert "`seed`</a> | whole number ≥ 0 and < 2147483648 |" in reference()
+    assert "`max_particles`</a> | whole number ≥ 1 and ≤ 2147483647 |" in reference()
+
+
+def test_each_key_in_the_reference_has_an_anchor_of_its_own():
+    rows = re.findall(r"^\| (?!key |---|material |\")(.*?) \|", reference(), re.MULTILINE)
+    found = [re.fullmatch(r'<a id="(.+?)" href="#\1">`(.+)`</a>', row) for row in rows]
+    assert len(rows) > 200
+    assert all(match and match[1].split(".")[-1] == match[2] for match in found)
+    anchors = [match[1] for match in found]
+    assert len(set(anchors)) == len(anchors)
+    assert {"name", "fluid.block.position", "shape.box.size", "cloth.shape.rectangle.counts", "material.look"} <= set(
+        anchors
+    )
 
 
 def test_the_reference_has_what_each_material_of_cloth_gives():
@@ -96,7 +108,7 @@ def test_the_reference_has_what_each_material_of_cloth_gives():
             list(numbers.values()), rel=1e-4
         )
     # Those of cotton are no defaults of another material.
-    (mass,) = (line for line in lines if line.startswith("| `mass_per_area`"))
+    (mass,) = (line for line in lines if "`mass_per_area`</a> |" in line)
     assert "| the material's |" in mass
 
 
