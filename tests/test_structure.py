@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from places import PROJECT
 
+import pipeline
+
 HEAVY = {"taichi", "bpy", "trimesh", "igl", "scipy", "av", "pysplashsurf", "openvdb", "distributed"}
 
 
@@ -96,6 +98,24 @@ def test_scripts_are_executable_and_valid_shell():
         path = PROJECT / script
         assert path.stat().st_mode & 0o111
         subprocess.run([shell, "-n", path], check=True)
+
+
+def test_the_container_gets_every_file_that_it_copies():
+    """And no other: what `.dockerignore` lets through is what `Containerfile` names."""
+    copied = {
+        source
+        for line in (PROJECT / "Containerfile").read_text(encoding="utf-8").splitlines()
+        if line.startswith("COPY ")
+        for source in line.split()[1:-1]
+    }
+    assert all((PROJECT / source).exists() for source in copied)
+    allowed = re.findall(r"^!(\S+)$", (PROJECT / ".dockerignore").read_text(encoding="utf-8"), re.MULTILINE)
+    assert {source.partition("/")[0] for source in copied} == set(allowed)
+
+
+def test_the_version_to_cite_is_the_programs():
+    cited = re.search(r"^version: (\S+)$", (PROJECT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    assert cited[1] == pipeline.__version__
 
 
 def test_no_two_test_files_have_one_name():
