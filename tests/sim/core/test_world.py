@@ -77,6 +77,16 @@ class Spring:
         self.followed.clear()
 
 
+def test_what_comes_before_a_substep_knows_whose_it_is_and_how_long():
+    world = World([Oscillator("a", 1 / 240), Oscillator("b", 1 / 120)], frames_per_second=60)
+    told = []
+    world.before_substep = lambda name, dt: told.append((name, dt, world.solvers[name].time_s))
+    world.advance_frame()
+    assert [name for name, _, _ in told] == ["a"] * 4 + ["b"] * 2
+    assert [dt for _, dt, _ in told] == pytest.approx([1 / 240] * 4 + [1 / 120] * 2)
+    assert [time_s for *_, time_s in told] == pytest.approx([0, 1 / 240, 2 / 240, 3 / 240, 0, 1 / 120])
+
+
 @pytest.mark.parametrize("dt", [1.0, 1 / 60, 0.0166, 1.0e-3, 7.7e-4])
 def test_frames_land_exactly_whatever_the_step(dt):
     oscillator = Oscillator("a", dt)
