@@ -34,7 +34,6 @@ from pipeline.store.cache import (
 )
 from pipeline.store.provenance import read_text
 from pipeline.store.receipts import read_receipt
-from sim.core.launch import on_compiled
 from sim.core.runtime import DeviceUnavailableError, initialize, resolve_device
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
@@ -137,6 +136,8 @@ class _Simulation:
     """One attempt at the simulation of a job."""
 
     def __init__(self, context: TaskContext) -> None:
+        from sim.core.launch import on_compiled  # it loads Taichi, which plans need not
+
         self._context = context
         on_compiled(self._tell_compiling)
         self._folder = context.layout.checkpoints
