@@ -89,6 +89,15 @@ def is_used(function: Callable[..., Any], argument: str) -> bool:
     return SEPARATOR not in argument or argument in getattr(function, "__used__", ())
 
 
+def field_paths(kind: Any, prefix: str = "") -> Iterator[str]:
+    """Dotted paths of the fields of a bundle that are arguments of kernels, in order."""
+    for field, field_kind in kind.__bundled__.items():
+        if is_bundle(field_kind):
+            yield from field_paths(field_kind, f"{prefix}{field}.")
+        else:
+            yield f"{prefix}{field}"
+
+
 def _leaves(name: str, kind: Any) -> Iterator[tuple[str, Any]]:
     """Names and types of the arguments that an argument becomes."""
     if is_bundle(kind):

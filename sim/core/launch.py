@@ -10,9 +10,10 @@ pins the release that they belong to.
 """
 
 import functools
+import operator
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import taichi as ti
@@ -21,7 +22,7 @@ from taichi.lang.matrix import VectorType
 from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
 
-from sim.core.bundles import flattened, is_used, with_fields_as_arguments
+from sim.core.bundles import field_paths, flattened, is_used, with_fields_as_arguments
 
 _REAL_TYPES = frozenset(primitive_types.real_types)
 
@@ -51,6 +52,14 @@ def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: o
     launches.pop(key, None)
 
 
+def _getter(paths: list[str]) -> Callable[[Any], Iterable[Any]]:
+    """A function that returns the values at dotted paths in a bundle, in order."""
+    if len(paths) > 1:
+        return operator.attrgetter(*paths)
+    get = operator.attrgetter(*paths)
+    return lambda value: (get(value),)
+
+
 class FastKernel:
     """A kernel that remembers what Taichi compiled for the types of its arguments; called as the kernel itself.
 
@@ -64,7 +73,8 @@ class FastKernel:
     def __init__(self, kernel: Any) -> None:
         functools.update_wrapper(self, kernel)
         self._primal = kernel._primal
-        self._kinds = getattr(self._primal.func, "__bundles__", ())
+        self._has_bundles = hasattr(self._primal.func, "__bundles__")
+        self._kinds = getattr(self._primal.func, "__bundles__", (None,) * len(self._primal.arguments))
         self._program: Any = None
         self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
         self._launches: dict[tuple[Any, ...], _Launch] = {}
@@ -74,39 +84,43 @@ class FastKernel:
     def __call__(self, *args: Any) -> Any:
         """Launch; waits for the device only where the kernel returns something."""
         program = impl.get_runtime().prog
-        if self._kinds:
-            args = self._flattened(args)
         if program is not self._program:
             self._program, self._compiled, self._launches = program, {}, {}
             self._on_cpu = impl.current_cfg().arch in (ti.x64, ti.arm64)
+        used = self._used(args) if self._has_bundles else args
         if self._on_cpu:
-            return self._call_on_cpu(program, args)
-        compiled = self._compiled.get(self._key(args))
+            return self._call_on_cpu(program, args, used)
+        compiled = self._compiled.get(self._key(used))
         if compiled is None:
             return self._first_call(program, args)
         context = compiled[0].make_launch_context()
         for index, place in self._arrays:
-            context.set_arg_ndarray(place, args[index].arr)
-        return self._launch(program, compiled[1], context, args, [None] * len(args))
+            context.set_arg_ndarray(place, used[index].arr)
+        return self._launch(program, compiled[1], context, used, [None] * len(used))
 
-    def _flattened(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Arguments with each bundle replaced by its fields. Raises TypeError where one is of another type."""
-        for value, kind in zip(args, self._kinds, strict=True):
-            if kind is not None and type(value) is not kind:
+    def _used(self, args: tuple[Any, ...]) -> list[Any]:
+        """Arguments that the kernel reads, fields of bundles among them. Raises TypeError where a bundle is another."""
+        used: list[Any] = []
+        for value, kind, fields in zip(args, self._kinds, self._fields, strict=True):
+            if kind is None:
+                used.append(value)
+            elif type(value) is not kind:
                 raise TypeError(f"{self.__name__} takes a {kind.__name__}, got a {type(value).__name__}")
-        return tuple(flattened(args))
+            elif fields is not None:
+                used += fields(value)
+        return used
 
-    def _call_on_cpu(self, program: Any, args: tuple[Any, ...]) -> Any:
+    def _call_on_cpu(self, program: Any, args: tuple[Any, ...], used: Sequence[Any]) -> Any:
         """Launch with the context of an earlier call with these arrays.
 
         Arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in every
         launch. On a GPU the arguments do not outlive the launch.
         """
-        arrays = [args[index] for index, _ in self._arrays]
-        key = (*[args[index] for index in self._templates], *map(id, arrays))
+        arrays = [used[index] for index, _ in self._arrays]
+        key = (*[used[index] for index in self._templates], *map(id, arrays))
         launch = self._launches.get(key)
         if launch is None:
-            compiled = self._compiled.get(self._key(args))
+            compiled = self._compiled.get(self._key(used))
             if compiled is None:
                 return self._first_call(program, args)
             context = compiled[0].make_launch_context()
@@ -118,33 +132,34 @@ class FastKernel:
                 self._launches.clear()
             forget = functools.partial(_forget, self._launches, key)
             references = tuple(weakref.ref(array, forget) for array in arrays)
-            launch = _Launch(compiled[1], context, references, [None] * len(args))
+            launch = _Launch(compiled[1], context, references, [None] * len(used))
             self._launches[key] = launch
-        return self._launch(program, launch.compiled, launch.context, args, launch.numbers)
+        return self._launch(program, launch.compiled, launch.context, used, launch.numbers)
 
-    def _key(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _key(self, used: Sequence[Any]) -> tuple[Any, ...]:
         """What a kernel is compiled for: compile-time values, and the types of arrays."""
-        types = [(args[index].element_type, len(args[index].shape)) for index, _ in self._arrays]
-        return (*[args[index] for index in self._templates], *types)
+        types = [(used[index].element_type, len(used[index].shape)) for index, _ in self._arrays]
+        return (*[used[index] for index in self._templates], *types)
 
     def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
         """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
         began = time.perf_counter()
-        result = self._primal(*args)
+        flat = tuple(flattened(args))
+        result = self._primal(*flat)
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
             self._sort_arguments()
-        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*args)]
+        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
         compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-        self._compiled[self._key(args)] = kernel, compiled
+        self._compiled[self._key(self._used(args) if self._has_bundles else args)] = kernel, compiled
         if (seconds := time.perf_counter() - began) > SLOW_S:
             for tell in _tell_compiled:
                 tell(self.__name__, seconds)
         return result.to_numpy().tolist() if self._returns_vector else result
 
-    def _launch(self, program: Any, compiled: Any, context: Any, args: tuple[Any, ...], passed: list[Any]) -> Any:
+    def _launch(self, program: Any, compiled: Any, context: Any, used: Sequence[Any], passed: list[Any]) -> Any:
         """Launch with arrays that the context has, and these numbers, of which it has those that are `passed`."""
-        self._pass_numbers(context, args, passed)
+        self._pass_numbers(context, used, passed)
         program.launch_kernel(compiled, context)
         if self._primal.return_type is None:
             return None
@@ -164,11 +179,24 @@ class FastKernel:
         self._integers: list[tuple[int, tuple[int]]] = []
         self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
         self._integer_vectors: list[tuple[int, list[tuple[int, int]]]] = []
-        for index, argument in enumerate(self._primal.arguments):
-            if isinstance(argument.annotation, ti.template):
-                self._templates.append(index)
-            elif is_used(self._primal.func, argument.name):
-                self._sort_argument(index, index - len(self._templates), argument.annotation)
+        self._fields: list[Callable[[Any], Iterable[Any]] | None] = [None] * len(self._kinds)
+        arguments = iter(enumerate(self._primal.arguments))
+        count = 0
+        for number, kind in enumerate(self._kinds):
+            paths = [""] if kind is None else list(field_paths(kind))
+            read = []
+            for path, (place, argument) in zip(paths, arguments, strict=False):
+                is_template = isinstance(argument.annotation, ti.template)
+                if not (is_template or is_used(self._primal.func, argument.name)):
+                    continue
+                if is_template:
+                    self._templates.append(count)
+                else:
+                    self._sort_argument(count, place - len(self._templates), argument.annotation)
+                read.append(path)
+                count += 1
+            if kind is not None and read:
+                self._fields[number] = _getter(read)
         self._used_count = len(getattr(self._primal.func, "__used__", ()))
 
     def _sort_argument(self, index: int, place: int, annotation: Any) -> None:
@@ -188,21 +216,21 @@ class FastKernel:
     def _returns_vector(self) -> bool:
         return self._primal.return_type is not None and isinstance(self._primal.return_type[0], VectorType)
 
-    def _pass_numbers(self, context: Any, args: tuple[Any, ...], passed: list[Any]) -> None:
+    def _pass_numbers(self, context: Any, used: Sequence[Any], passed: list[Any]) -> None:
         """Numbers that are the same objects as those passed before are there already."""
         for index, place in self._floats:
-            if args[index] is not passed[index]:
-                context.set_arg_float(place, args[index])
-                passed[index] = args[index]
+            if used[index] is not passed[index]:
+                context.set_arg_float(place, used[index])
+                passed[index] = used[index]
         for index, place in self._integers:
-            if args[index] is not passed[index]:
-                context.set_arg_int(place, args[index])
-                passed[index] = args[index]
+            if used[index] is not passed[index]:
+                context.set_arg_int(place, used[index])
+                passed[index] = used[index]
         for index, places in self._float_vectors:
-            for place, component in zip(places, args[index], strict=True):
+            for place, component in zip(places, used[index], strict=True):
                 context.set_struct_arg_float(place, component)
         for index, places in self._integer_vectors:
-            for place, component in zip(places, args[index], strict=True):
+            for place, component in zip(places, used[index], strict=True):
                 context.set_struct_arg_int(place, component)
 
 
