@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pipeline.base.errors import JobFileError, PipelineError
+from pipeline.base.errors import JobFileError, PipelineError, PlanError
 from pipeline.base.layout import JobLayout
 from pipeline.base.places import check_places
 from pipeline.queue.submitting import QueueOptions
@@ -229,18 +229,12 @@ def _match(pattern: re.Pattern[str], text: str, wanted: str) -> tuple[str, ...]:
 
 def parse_frames(text: str) -> frozenset[int]:
     """Frame numbers from `3`, `0-9` or `0-9,20,30-39`. Raises BadParameter."""
-    frames: set[int] = set()
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        if not first.isdigit() or (dash and not last.isdigit()):
-            raise click.BadParameter(f'"{part.strip()}" is not a frame or a range of frames, like 7 or 0-29')
-        start, stop = int(first), int(last or first)
-        if stop < start:
-            raise click.BadParameter(f'"{part.strip()}" runs backwards')
-        if stop - start > 1_000_000:
-            raise click.BadParameter(f'"{part.strip()}" is more than a million frames')
-        frames.update(range(start, stop + 1))
-    return frozenset(frames)
+    from pipeline.run import plan
+
+    try:
+        return plan.parse_frames(text)
+    except PlanError as error:
+        raise click.BadParameter(str(error)) from None
 
 
 _QUEUE_OPTIONS: tuple[Callable[[Any], Any], ...] = (

@@ -10,9 +10,10 @@ from pipeline import __version__
 from pipeline.base.errors import PLACE_TROUBLES, DiskFullError, PipelineError
 from pipeline.base.wording import printable
 from pipeline.cli.control import cancel, pause, priority, resume, work
+from pipeline.cli.export import export
 from pipeline.cli.keep import clean, doctor, schema, verify
 from pipeline.cli.look import explain, status
-from pipeline.cli.make import check, export, new, plan, rerun, submit
+from pipeline.cli.make import check, new, plan, rerun, submit
 from pipeline.cli.pages import dashboard, live, view
 from pipeline.cli.pictures import animatic, compare, loop, report, still
 from pipeline.run.executors.failures import is_disk_full

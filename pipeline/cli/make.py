@@ -1,4 +1,4 @@
-"""Commands that make films: new, check, plan, submit, rerun, export."""
+"""Commands that make films: new, check, plan, submit, rerun."""
 
 from __future__ import annotations
 
@@ -211,59 +211,6 @@ def _try_failed_again(job: str, output: Path, options: QueueOptions) -> int:
     queue, name = place(job, output)
     again = options.applied_to(another_try(queue, name, background=options.detach))
     return stand_in_queue(queue, as_given(queue.layout(name)), again, detach=options.detach)
-
-
-@click.group()
-def export() -> None:
-    """Hand a job over to another farm manager.
-
-    \b
-    pipeline export openjd dam.toml --output /shared/renders
-    """
-
-
-@export.command()
-@job_options
-@output_option
-@click.option(
-    "--python",
-    default=sys.executable,
-    help="The interpreter with this program on the farm's machines; the present one if omitted.",
-)
-def openjd(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path, python: str) -> None:
-    """Write an Open Job Description template, and the job's folder that it works in.
-
-    A step for each stage, cut into chunks of frames where frames do not depend on each other. The folder must lie on a
-    disk that all machines share; the template lies in it. What the farm has made, `pipeline resume` takes over.
-
-    \b
-    pipeline export openjd dam.toml --output /shared/renders
-    openjd check /shared/renders/dam/openjd.json
-    openjd run /shared/renders/dam/openjd.json --step movie --run-dependencies
-    """
-    from pipeline.base.files import replace_durably
-    from pipeline.base.lease import refuse_if_held
-    from pipeline.base.places import check_places
-    from pipeline.job.inputs import keep_inputs
-    from pipeline.run.checked_job import checked, read_own_job
-    from pipeline.run.executors.choice import require_named_devices
-    from pipeline.run.plan import plan_job
-    from pipeline.show.openjd import job_template
-    from pipeline.stages import STAGES
-
-    loaded, _ = checked(read_own_job(job_file, overrides, preview=preview))
-    require_named_devices(loaded.job, [stage.name for stage in STAGES])
-    print_warnings(loaded.warnings)
-    layout = JobLayout((output / loaded.job.name).absolute())
-    refuse_if_held(layout.lease)
-    layout.root.mkdir(parents=True, exist_ok=True)
-    check_places(layout)
-    job, text = keep_inputs(loaded, layout)
-    replace_durably(layout.job_file, text)
-    described = job_template(job.name, plan_job(job, layout, STAGES), python=python)
-    path = layout.root / "openjd.json"
-    replace_durably(path, json.dumps(described, indent=2, ensure_ascii=False) + "\n")
-    click.echo(f"wrote {path}; its job's folder is {layout.root}")
 
 
 def assessment_as_json(assessment: Assessment) -> dict[str, Any]:

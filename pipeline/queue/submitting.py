@@ -181,7 +181,7 @@ def stages_to_run(state: JobAssessment | None) -> frozenset[str]:
     from pipeline.stages import STAGES
 
     if state is None:
-        return frozenset(stage.name for stage in STAGES)
+        return frozenset(stage.name for stage in STAGES if not stage.on_demand)
     return frozenset(each.task.stage for each in state.assessments if each.verdict is not Verdict.UP_TO_DATE)
 
 

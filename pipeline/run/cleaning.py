@@ -60,6 +60,7 @@ def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Pa
         )
     tasks = plan_job(job, layout, STAGES)
     planned = {output for task in tasks for output in task.outputs}
+    asked = {stage.name for stage in STAGES if stage.on_demand}  # what was once asked for is not superseded
     theirs = {task.id for task in tasks if task.stage in choice.stages}
     with Manifest(layout.manifest) as manifest:
         rows = manifest.artifacts()
@@ -69,7 +70,12 @@ def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Pa
             for artifact, row in rows.items()
             if row.task in theirs
             or row.task.split("/")[0] in choice.stages
-            or (choice.superseded and artifact not in planned and (job.recorded is None or row.task != "simulate"))
+            or (
+                choice.superseded
+                and artifact not in planned
+                and row.task.split("/")[0] not in asked
+                and (job.recorded is None or row.task != "simulate")
+            )
         ]
         others: list[Path] = []
         if choice.checkpoints or "simulate" in choice.stages:

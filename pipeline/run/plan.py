@@ -77,7 +77,8 @@ def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequen
     """The tasks of a job, makers before users.
 
     With stages `until` after which the job ends, only their tasks and what these need. What comes after them is not
-    even asked for a plan, as that may need a Blender.
+    even asked for a plan, as that may need a Blender. A stage may be named with frames, as `surface:10-19`. Stages on
+    demand, as exports are, are planned only where they are named.
 
     Raises:
         PlanError: two tasks share a name or an output, an input has no maker, tasks wait for each other in a circle, or
@@ -85,18 +86,53 @@ def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequen
     """
     with many_objects():
         if not until:
-            return in_order([task for stage in stages for task in stage.plan(job, layout)])
+            return in_order([task for stage in stages if not stage.on_demand for task in stage.plan(job, layout)])
+        ends = dict(map(parse_end, until))
         names = [stage.name for stage in stages]
-        for name in until:
+        for name in ends:
             if name not in names:
                 raise PlanError(f'no stage "{name}"; the stages are {", ".join(names)}')
-        last = max(names.index(name) for name in until)
-        tasks = in_order([task for stage in stages[: last + 1] for task in stage.plan(job, layout)])
-        for name in until:
-            if all(task.stage != name for task in tasks):
+        last = max(names.index(name) for name in ends)
+        asked = [stage for stage in stages[: last + 1] if not stage.on_demand or stage.name in ends]
+        tasks = in_order([t for stage in asked for t in stage.of_frames(ends.get(stage.name)).plan(job, layout)])
+        wanted = {
+            task.id
+            for task in tasks
+            if task.stage in ends and (task.frame is None or task.frame in (ends[task.stage] or {task.frame}))
+        }
+        for name in ends:
+            if all(task.stage != name for task in tasks if task.id in wanted):
                 theirs = ", ".join(dict.fromkeys(task.stage for task in tasks)) or "none before it"
                 raise PlanError(f'this job has nothing for the stage "{name}"; it has {theirs}')
-        return made_from({task.id for task in tasks if task.stage in until}, tasks)
+        return made_from(wanted, tasks)
+
+
+def parse_end(text: str) -> tuple[str, frozenset[int] | None]:
+    """A stage after which a job ends, and its frames that are wanted: `surface` or `surface:0-9,20`.
+
+    Raises PlanError: the frames are none.
+    """
+    name, colon, ranges = text.partition(":")
+    return name, parse_frames(ranges) if colon else None
+
+
+_MOST_FRAMES = 1_000_000
+
+
+def parse_frames(text: str) -> frozenset[int]:
+    """Frame numbers from `3`, `0-9` or `0-9,20,30-39`. Raises PlanError."""
+    frames: set[int] = set()
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdigit() or (dash and not last.isdigit()):
+            raise PlanError(f'"{part.strip()}" is not a frame or a range of frames, like 7 or 0-29')
+        start, stop = int(first), int(last or first)
+        if stop < start:
+            raise PlanError(f'"{part.strip()}" runs backwards')
+        if stop - start > _MOST_FRAMES:
+            raise PlanError(f'"{part.strip()}" is more than a million frames')
+        frames.update(range(start, stop + 1))
+    return frozenset(frames)
 
 
 def made_from(targets: Collection[TaskId], tasks: Sequence[Task]) -> list[Task]:

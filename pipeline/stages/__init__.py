@@ -7,11 +7,16 @@ from pipeline.kinds.table import KINDS
 from pipeline.stages.base import Stage
 from pipeline.stages.bodies import BodiesStage
 from pipeline.stages.bounds import BoundsStage
+from pipeline.stages.export import ExportStage
+from pipeline.stages.export_vtk import VtkExport
 from pipeline.stages.movie import MovieStage
 from pipeline.stages.product import ProductStage
 from pipeline.stages.render import RenderStage
 from pipeline.stages.simulate import SimulateStage
 from pipeline.stages.whitewater import WhitewaterStage
+
+EXPORTS: dict[str, ExportStage] = {stage.format: stage for stage in (VtkExport(),)}
+"""What a job can be exported to, by the name of the format."""
 
 
 class _Stages(Sequence[Stage]):
@@ -20,7 +25,7 @@ class _Stages(Sequence[Stage]):
     def _all(self) -> tuple[Stage, ...]:
         before: tuple[Stage, ...] = (BodiesStage(), SimulateStage())
         products = (ProductStage(kind, kind.product) for kind in KINDS.values() if kind.product is not None)
-        return (*before, *products, WhitewaterStage(), BoundsStage(), RenderStage(), MovieStage())
+        return (*before, *products, WhitewaterStage(), BoundsStage(), *EXPORTS.values(), RenderStage(), MovieStage())
 
     def __len__(self) -> int:
         return len(self._all())

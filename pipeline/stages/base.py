@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
@@ -53,10 +53,15 @@ class Stage(Protocol):
     name: str
     version: int  # raised when the same parameters and inputs give other outputs; part of the fingerprint
     about: str = ""  # what it makes, in a few words for people
+    on_demand: bool = False  # whether it is no part of the film, and planned only for who asks for it
 
     @abstractmethod
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The tasks of this stage. Pure."""
+
+    def of_frames(self, frames: frozenset[int] | None) -> Self:  # noqa: ARG002
+        """The stage for these frames alone; None: for all. One that does not choose is as it was."""
+        return self
 
     def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
         """Why this machine cannot run this stage of this job, a sentence each with a remedy; empty if it can."""

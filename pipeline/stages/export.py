@@ -1,0 +1,79 @@
+"""Exports: a job's frames in the files of other programs, made when somebody asks for them (`pipeline export`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import copy
+from pathlib import PurePosixPath
+from typing import Self
+
+from pipeline.base.errors import PlanError
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath, Task
+from pipeline.model.job import Job
+from pipeline.model.looks import parts_of
+from pipeline.stages.base import Stage
+from sim.rigid.parameters import RigidBodyParameters
+
+PREFIX = "export-"  # begins the names of these stages; that of the format follows
+
+
+class ExportStage(Stage):
+    """A stage that hands frames over to other programs: parts of each frame, and one file to open.
+
+    Attributes:
+        format: its name, as `pipeline export --to` takes it.
+        about: what it is, for people.
+        opened_by: how to open it, a sentence with {file}.
+        frames: those that are chosen; None: all.
+        refers_to: folders of the job whose files the export shows by relative paths instead of copying them.
+    """
+
+    on_demand = True
+    format: str
+    about: str
+    opened_by: str
+    frames: frozenset[int] | None = None
+    refers_to: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """Name of the stage."""
+        return f"{PREFIX}{self.format}"
+
+    def of_frames(self, frames: frozenset[int] | None) -> Self:
+        """The same for some frames."""
+        chosen = copy(self)
+        chosen.frames = frames
+        return chosen
+
+    def root(self, job: Job) -> ArtifactPath:
+        """The file to open, right below the job's folder: what it refers to lies beside it."""
+        return ArtifactPath(f"{job.name}.{self.format}")
+
+    def chosen(self, job: Job) -> list[int]:
+        """The frames to export. Raises PlanError: one is not in the film."""
+        frames = range(job.frame_count) if self.frames is None else sorted(self.frames)
+        if frames and frames[-1] >= job.frame_count:
+            raise PlanError(f"{job.name} has no frame {frames[-1]}; its frames are 0-{job.frame_count - 1}")
+        return list(frames)
+
+    def belonging(self, tasks: list[Task]) -> list[ArtifactPath]:
+        """What has to lie together for the export to be whole, the file to open last."""
+        mine = [task for task in tasks if task.stage == self.name]
+        shown = [
+            artifact for task in mine for artifact in task.inputs if PurePosixPath(artifact).parts[0] in self.refers_to
+        ]
+        return [*dict.fromkeys([*shown, *(output for task in mine for output in task.outputs)])]
+
+
+def frame_of(artifact: ArtifactPath) -> int:
+    """The frame in the name of a file of one frame."""
+    return int(PurePosixPath(artifact).stem)
+
+
+def meshes_of(job: Job) -> Iterator[tuple[RigidBodyParameters, str, ArtifactPath]]:
+    """Every part of every rigid body with its mesh at rest."""
+    for body in job.rigid:
+        for part in parts_of(body.shape.type):
+            yield body, part, JobLayout.body_mesh(body.name, part)

@@ -1,0 +1,217 @@
+"""Export for ParaView and other programs of VTK: every array of every body, one time series."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.kinds.table import bodies
+from pipeline.model.job import Job
+from pipeline.stages.base import TaskContext
+from pipeline.stages.export import ExportStage, frame_of, meshes_of
+from pipeline.store.cache import open_bodies, read_compact
+from render.meshes import read_ply
+from render.point_clouds import read_point_cloud
+from render.vtk_files import Values, validate_vtk, write_blocks, write_grid, write_polydata, write_series
+from sim.core.motion.rotation import from_degrees, rotated
+
+FOLDER = "vtk"
+UNITS = {
+    "velocity": "m/s",
+    "density": "kg/m3",
+    "pressure": "Pa",
+    "particle_id": "1",
+    "uv": "m",
+    "normals": "1",
+    "temperature": "K",
+}
+
+
+class VtkExport(ExportStage):
+    """Files of each frame: particles, surfaces, cloths, bodies where they are, cells of smoke; one series of them."""
+
+    format = "vtk"
+    version = 1
+    about = "one time series for ParaView: particles, surfaces, cloths, bodies and smoke, with names and units"
+    opened_by = "open {file} in ParaView (paraview {file})"
+
+    def root(self, job: Job) -> ArtifactPath:
+        """ParaView's own ending."""
+        return ArtifactPath(f"{job.name}.pvd")
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a frame, and one for the series."""
+        parameters = ParameterSet.of(
+            stage=self.name,
+            version=self.version,
+            tools={},
+            static={
+                body.name: {"position": body.position, "rotation_deg": body.rotation_deg}
+                for body in job.rigid
+                if body.kind == "static"
+            },
+        )
+        meshes = [mesh for _, _, mesh in meshes_of(job)]
+        tasks = []
+        for frame in self.chosen(job):
+            surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
+            points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+            blocks = [file for _, file in _blocks(job, frame)]
+            tasks.append(
+                Task(
+                    id=TaskId(f"{self.name}/{frame:06d}"),
+                    stage=self.name,
+                    inputs=(layout.frame_cache(frame), *meshes, *surfaces, *points),
+                    outputs=(*blocks, _frame_file(frame)),
+                    parameters=parameters,
+                    frame=frame,
+                )
+            )
+        series = Task(
+            id=TaskId(f"{self.name}/series"),
+            stage=self.name,
+            inputs=tuple(task.outputs[-1] for task in tasks),
+            outputs=(self.root(job),),
+            parameters=ParameterSet.of(stage=self.name, version=self.version, tools={}, fps=job.fps),
+        )
+        return [*tasks, series]
+
+    def run(self, context: TaskContext) -> None:
+        """Write the files of a frame, or the series."""
+        task, job = context.task, context.job
+        if task.frame is None:
+            with context.committing(task.outputs[0], validate_vtk) as path:
+                write_series(path, [(frame_of(each) / job.fps, str(each)) for each in task.inputs])
+        else:
+            _Frame(job, context.layout, task.frame).write(context)
+        context.progress(1, 1)
+
+
+def _frame_file(frame: int) -> ArtifactPath:
+    return ArtifactPath(f"{FOLDER}/{frame:06d}.vtm")
+
+
+def _blocks(job: Job, frame: int) -> list[tuple[str, ArtifactPath]]:
+    """Names of a frame's blocks, and their files."""
+    blocks = []
+    for _, kind, body in bodies(job):
+        suffix = "vti" if kind.display.form == "density" else "vtp"
+        blocks.append((body.name, suffix))
+        if kind.name == "fluid":
+            blocks.append((f"{body.name}.surface", "vtp"))
+        if body.name in job.whitewater:
+            blocks.append((f"{body.name}.whitewater", "vtp"))
+    return [(name, ArtifactPath(f"{FOLDER}/{name}/{frame:06d}.{suffix}")) for name, suffix in blocks]
+
+
+class _Frame:
+    """The files of one frame."""
+
+    def __init__(self, job: Job, layout: JobLayout, frame: int) -> None:
+        self._job, self._layout, self._frame = job, layout, frame
+        self._time_s = frame / job.fps
+        self._cache = layout.path(layout.frame_cache(frame))
+
+    def write(self, context: TaskContext) -> None:
+        """Commit every block, then what names them."""
+        writers = dict(self._writers())
+        blocks = _blocks(self._job, self._frame)
+        for name, artifact in blocks:
+            with context.committing(artifact, validate_vtk) as path:
+                writers[name](path)
+        with context.committing(_frame_file(self._frame), validate_vtk) as path:
+            write_blocks(path, [(name, str(artifact).removeprefix(f"{FOLDER}/")) for name, artifact in blocks])
+
+    def _writers(self) -> Iterator[tuple[str, Callable[[Path], None]]]:
+        of_form = {"points": self._points, "mesh": self._mesh, "parts": self._parts, "density": self._cells}
+        with open_bodies(self._cache) as groups:
+            there = set(groups)
+        for _, kind, body in bodies(self._job):
+            yield body.name, partial(of_form[kind.display.form], body=body, there=there)
+            if kind.name == "fluid":
+                yield f"{body.name}.surface", partial(self._surface, name=body.name)
+            if body.name in self._job.whitewater:
+                yield f"{body.name}.whitewater", partial(self._whitewater, name=body.name)
+
+    def _points(self, path: Path, *, body: Any, there: set[str]) -> None:  # noqa: ARG002
+        snapshot = read_compact(self._cache, body.name)
+        arrays = dict(snapshot.arrays)
+        position = arrays.pop("position")
+        values = {key: Values(array, UNITS.get(key, "1")) for key, array in arrays.items()}
+        radius = np.full(len(position), snapshot.number("particle_radius"), np.float32)
+        write_polydata(path, position, point_values={**values, "radius": Values(radius, "m")}, time_s=self._time_s)
+
+    def _mesh(self, path: Path, *, body: Any, there: set[str]) -> None:  # noqa: ARG002
+        arrays = dict(read_compact(self._cache, body.name).arrays)
+        position, triangles = arrays.pop("position"), arrays.pop("triangles")
+        values = {key: Values(array, UNITS.get(key, "1")) for key, array in arrays.items()}
+        write_polydata(path, position, triangles=triangles, point_values=values, time_s=self._time_s)
+
+    def _parts(self, path: Path, *, body: Any, there: set[str]) -> None:
+        meshes = [
+            read_ply(self._layout.path(mesh)) for owner, _, mesh in meshes_of(self._job) if owner.name == body.name
+        ]
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        rest = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float64)
+        triangles = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)])
+        part = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(mesh.faces) for mesh in meshes])
+        if body.kind == "static" or body.name not in there:
+            position, orientation = np.array(body.position), from_degrees(body.rotation_deg)
+            velocity, spin = np.zeros(3), np.zeros(3)
+        else:
+            pose = read_compact(self._cache, body.name).arrays
+            position, orientation, velocity, spin = (
+                np.asarray(pose[key], np.float64) for key in ("position", "orientation", "velocity", "angular_velocity")
+            )
+        arms = rotated(orientation, rest)
+        speeds = (velocity + np.cross(spin, arms)).astype(np.float32)
+        write_polydata(
+            path,
+            position + arms,
+            triangles=triangles,
+            point_values={"velocity": Values(speeds, UNITS["velocity"])},
+            cell_values={"part": Values(part, "1")},
+            time_s=self._time_s,
+        )
+
+    def _cells(self, path: Path, *, body: Any, there: set[str]) -> None:  # noqa: ARG002
+        smoke = read_compact(self._cache, body.name)
+        values = {
+            "density": Values(smoke.density, "1"),
+            "temperature": Values(smoke.temperature, UNITS["temperature"]),
+            "velocity": Values(smoke.velocity, UNITS["velocity"]),
+        }
+        write_grid(
+            path,
+            values,
+            first_cell=smoke.first_cell,
+            origin=smoke.origin,
+            cell_size=smoke.cell_size,
+            time_s=self._time_s,
+        )
+
+    def _surface(self, path: Path, *, name: str) -> None:
+        mesh = read_ply(self._layout.path(self._layout.surface(name, self._frame)))
+        values = {
+            key: Values(array, unit)
+            for key, array, unit in (("velocity", mesh.velocities, "m/s"), ("normals", mesh.normals, "1"))
+            if array is not None
+        }
+        write_polydata(path, mesh.vertices, triangles=mesh.faces, point_values=values, time_s=self._time_s)
+
+    def _whitewater(self, path: Path, *, name: str) -> None:
+        cloud = read_point_cloud(self._layout.path(self._layout.whitewater(name, self._frame)))
+        values = {
+            "velocity": Values(cloud.velocity, "m/s"),
+            "radius": Values(cloud.radius, "m"),
+            "lifetime": Values(cloud.lifetime, "s"),
+            "kind": Values(cloud.kind, "1"),
+        }
+        write_polydata(path, cloud.position, point_values=values, time_s=self._time_s)
