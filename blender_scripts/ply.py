@@ -29,6 +29,8 @@ GROUPS = {
 _LONGEST_HEADER = 4096
 _HEADER_END = b"end_header\n"
 
+FADE_S = 0.25
+"""Over the end of its life a particle shrinks to nothing, instead of vanishing from one frame to the next [s]."""
 KINDS = ("spray", "foam", "bubbles")  # names of the values of `kind` of whitewater, from 0
 POINT = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz", "radius", "lifetime")), ("kind", "u1")])
 _COMMENT = "comment not_made {not_made}\n"
@@ -159,6 +161,12 @@ def read_points(content: bytes) -> NDArray[np.void]:
     count = int(header["count"])
     _require_size(content, header.end() + count * POINT.itemsize)
     return np.frombuffer(content, POINT, count, header.end())
+
+
+def drawn_radii(radius: NDArray[np.float32], lifetime: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Radii of whitewater as pictures show them [m], (n,): they shrink to nothing over the last `FADE_S`."""
+    shown: NDArray[np.float32] = (radius * np.cbrt(np.clip(lifetime / FADE_S, 0.0, 1.0))).astype(np.float32)
+    return shown
 
 
 def _mesh_header(content: bytes) -> tuple[MeshHeader, int]:

@@ -12,11 +12,8 @@ import numpy as np
 from blender_scripts.documents import content_of
 from blender_scripts.errors import RenderInputError
 from blender_scripts.geometry import new_object, set_attribute
-from blender_scripts.ply import KINDS, POINT
+from blender_scripts.ply import KINDS, POINT, drawn_radii
 from blender_scripts.ply import read_points as read_rows
-
-FADE_S = 0.25
-"""Over the end of its life a particle shrinks to nothing, instead of vanishing from one frame to the next [s]."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ def read_points(path: Path, kind: str) -> Points:
     return Points(
         positions=np.stack([chosen[name] for name in ("x", "y", "z")], axis=1).astype(np.float32),
         velocities=np.stack([chosen[name] for name in ("vx", "vy", "vz")], axis=1).astype(np.float32),
-        radii=(chosen["radius"] * np.cbrt(np.clip(chosen["lifetime"] / FADE_S, 0.0, 1.0))).astype(np.float32),
+        radii=drawn_radii(chosen["radius"], chosen["lifetime"]),
     )
 
 

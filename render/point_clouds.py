@@ -8,10 +8,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from blender_scripts.ply import KINDS, POINT, POINTS_HEADER, points_header, read_points
+from blender_scripts.ply import KINDS, POINT, POINTS_HEADER, drawn_radii, points_header, read_points
 from render.errors import InvalidFileError, invalid_if_refused
 
-__all__ = ["KINDS", "PointCloud", "read_point_cloud", "read_point_counts", "validate_point_cloud", "write_point_cloud"]
+__all__ = [
+    "KINDS",
+    "PointCloud",
+    "drawn_radii",
+    "read_point_cloud",
+    "read_point_counts",
+    "validate_point_cloud",
+    "write_point_cloud",
+]
 
 _LONGEST_HEADER = len(POINTS_HEADER) + 32
 

@@ -26,7 +26,7 @@ from pipeline.queue.submitting import QueueOptions
 if TYPE_CHECKING:
     from pipeline.stages.export import ExportStage
 
-FORMATS = ("vtk",)
+FORMATS = ("vtk", "usd")
 """As the stages have them, which are too heavy to be imported for `--help`."""
 OPENJD = "openjd"
 
@@ -108,13 +108,14 @@ def _export(
     target: Path | None,
 ) -> None:
     from pipeline.job.loading import load_job, read_job
-    from pipeline.queue.job_queue import JobQueue
+    from pipeline.queue.job_queue import Desired, JobQueue
     from pipeline.show.handing_over import copy_export, refuse_if_busy, survey_export
     from pipeline.stages import STAGES
 
     job = read_job(job_file, overrides, preview=preview).job
     layout = submission_folder(job_file, job.name, output, is_changed=bool(overrides) or preview)
-    refuse_if_busy(layout, is_queued=JobQueue.of(layout).find(layout.root.absolute().name) is not None)
+    waiting = JobQueue.of(layout).find(layout.root.absolute().name)
+    refuse_if_busy(layout, None if waiting is None or waiting.desired is Desired.NONE else waiting.until)
     code = submit_until(job_file, overrides, preview=preview, until=(end,), output=output, options=options)
     if code or options.detach:
         if target is not None and not code:

@@ -16,7 +16,7 @@ from pipeline.base.wording import counted
 from pipeline.model.job import Job
 from pipeline.run.plan import frame_ranges, parse_end, plan_job
 from pipeline.stages.base import Stage
-from pipeline.stages.export import ExportStage
+from pipeline.stages.export import PREFIX, ExportStage
 
 
 @dataclass(frozen=True)
@@ -70,13 +70,14 @@ def copy_export(export: Export, layout: JobLayout, target: Path) -> int:
     return copied
 
 
-def refuse_if_busy(layout: JobLayout, *, is_queued: bool) -> None:
-    """Refuse to export a job that is being made or waits for its turn: that would take its film's place.
+def refuse_if_busy(layout: JobLayout, until: Sequence[str] | None) -> None:
+    """Refuse to export a job that is being made or waits for its turn: an export would take its film's place.
 
+    `until` are the stages after which it ends that waits in the queue; None: nothing waits. An export may be replaced.
     Raises PipelineError.
     """
     refuse_if_held(layout.lease)
-    if is_queued:
+    if until is not None and not (until and all(end.startswith(PREFIX) for end in until)):
         raise PipelineError(
             f"{layout.root} waits in the queue, and an export would take its place; let it end, or: "
             f"pipeline cancel {layout.root}"

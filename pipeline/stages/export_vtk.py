@@ -16,11 +16,11 @@ from pipeline.kinds.table import bodies
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, frame_of, meshes_of
-from pipeline.store.cache import open_bodies, read_compact
+from pipeline.store.cache import read_compact
 from render.meshes import read_ply
 from render.point_clouds import read_point_cloud
 from render.vtk_files import Values, validate_vtk, write_blocks, write_grid, write_polydata, write_series
-from sim.core.motion.rotation import from_degrees, rotated
+from sim.core.motion.rotation import rotated
 
 FOLDER = "vtk"
 UNITS = {
@@ -52,11 +52,6 @@ class VtkExport(ExportStage):
             stage=self.name,
             version=self.version,
             tools={},
-            static={
-                body.name: {"position": body.position, "rotation_deg": body.rotation_deg}
-                for body in job.rigid
-                if body.kind == "static"
-            },
         )
         meshes = [mesh for _, _, mesh in meshes_of(job)]
         tasks = []
@@ -131,16 +126,14 @@ class _Frame:
 
     def _writers(self) -> Iterator[tuple[str, Callable[[Path], None]]]:
         of_form = {"points": self._points, "mesh": self._mesh, "parts": self._parts, "density": self._cells}
-        with open_bodies(self._cache) as groups:
-            there = set(groups)
         for _, kind, body in bodies(self._job):
-            yield body.name, partial(of_form[kind.display.form], body=body, there=there)
+            yield body.name, partial(of_form[kind.display.form], body=body)
             if kind.name == "fluid":
                 yield f"{body.name}.surface", partial(self._surface, name=body.name)
             if body.name in self._job.whitewater:
                 yield f"{body.name}.whitewater", partial(self._whitewater, name=body.name)
 
-    def _points(self, path: Path, *, body: Any, there: set[str]) -> None:  # noqa: ARG002
+    def _points(self, path: Path, *, body: Any) -> None:
         snapshot = read_compact(self._cache, body.name)
         arrays = dict(snapshot.arrays)
         position = arrays.pop("position")
@@ -148,13 +141,13 @@ class _Frame:
         radius = np.full(len(position), snapshot.number("particle_radius"), np.float32)
         write_polydata(path, position, point_values={**values, "radius": Values(radius, "m")}, time_s=self._time_s)
 
-    def _mesh(self, path: Path, *, body: Any, there: set[str]) -> None:  # noqa: ARG002
+    def _mesh(self, path: Path, *, body: Any) -> None:
         arrays = dict(read_compact(self._cache, body.name).arrays)
         position, triangles = arrays.pop("position"), arrays.pop("triangles")
         values = {key: Values(array, UNITS.get(key, "1")) for key, array in arrays.items()}
         write_polydata(path, position, triangles=triangles, point_values=values, time_s=self._time_s)
 
-    def _parts(self, path: Path, *, body: Any, there: set[str]) -> None:
+    def _parts(self, path: Path, *, body: Any) -> None:
         meshes = [
             read_ply(self._layout.path(mesh)) for owner, _, mesh in meshes_of(self._job) if owner.name == body.name
         ]
@@ -162,14 +155,10 @@ class _Frame:
         rest = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float64)
         triangles = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)])
         part = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(mesh.faces) for mesh in meshes])
-        if body.kind == "static" or body.name not in there:
-            position, orientation = np.array(body.position), from_degrees(body.rotation_deg)
-            velocity, spin = np.zeros(3), np.zeros(3)
-        else:
-            pose = read_compact(self._cache, body.name).arrays
-            position, orientation, velocity, spin = (
-                np.asarray(pose[key], np.float64) for key in ("position", "orientation", "velocity", "angular_velocity")
-            )
+        pose = read_compact(self._cache, body.name).arrays
+        position, orientation, velocity, spin = (
+            np.asarray(pose[key], np.float64) for key in ("position", "orientation", "velocity", "angular_velocity")
+        )
         arms = rotated(orientation, rest)
         speeds = (velocity + np.cross(spin, arms)).astype(np.float32)
         write_polydata(
@@ -181,7 +170,7 @@ class _Frame:
             time_s=self._time_s,
         )
 
-    def _cells(self, path: Path, *, body: Any, there: set[str]) -> None:  # noqa: ARG002
+    def _cells(self, path: Path, *, body: Any) -> None:
         smoke = read_compact(self._cache, body.name)
         values = {
             "density": Values(smoke.density, "1"),

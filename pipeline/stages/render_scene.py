@@ -72,8 +72,12 @@ def write_motion(job: Job, layout: JobLayout, frame: int, *, attempt: int) -> tu
             views[offset] = camera.view((frame + offset) / job.fps, places)
         with _replacing(layout, layout.views, frame, attempt) as path:
             write_views(path, frame, views)
-    places = {name: _position_after(0.0, poses[name]) for name in camera.bodies}
-    return poses, camera.view(frame / job.fps, places)
+    return poses, view_at(job, camera, frame, poses)
+
+
+def view_at(job: Job, camera: CameraPath, frame: int, poses: Poses) -> View:
+    """The view of a camera at a frame, of bodies with these poses."""
+    return camera.view(frame / job.fps, {name: _position_after(0.0, poses[name]) for name in camera.bodies})
 
 
 def _position_after(time_s: float, pose: Mapping[str, NDArray[Any]]) -> list[float]:

@@ -1,0 +1,180 @@
+"""Export as Universal Scene Description: a scene for Houdini, Maya, Blender, Omniverse and others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from pipeline.base.content import tool_version
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.kinds.base import Kind
+from pipeline.kinds.table import bodies, material_of, products_of
+from pipeline.model.job import Job
+from pipeline.stages.base import TaskContext
+from pipeline.stages.export import ExportStage, frame_of, meshes_of
+from pipeline.stages.render_scene import camera_path, framed_points, render_spec, view_at
+from pipeline.store.cache import read_compact, read_frame
+from render.camera_path import View
+from render.meshes import read_ply
+from render.point_clouds import KINDS, drawn_radii, read_point_cloud
+from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, PointSequenceObject, RenderSpec
+from render.usd_files import Placement, Points, validate_usd, write_usd_frame, write_usd_scene
+
+FOLDER = "usd"
+MANIFEST = ArtifactPath(f"{FOLDER}/manifest.usda")
+
+
+class UsdExport(ExportStage):
+    """A layer of each frame with what changes shape, and the scene that plays them."""
+
+    format = "usd"
+    version = 1
+    about = (
+        "a scene for Houdini, Maya, Omniverse, Blender: surfaces, cloths, bodies, points, volumes, camera, materials"
+    )
+    opened_by = (
+        "open {file} in any program of USD (usdview {file}; Blender: File > Import > Universal Scene Description)"
+    )
+    refers_to = ("volumes",)
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a frame, and one for the scene."""
+        tools = {"usd-core": tool_version("usd-core")}
+        spec = render_spec(job, layout)
+        of_frames = ParameterSet.of(
+            stage=self.name, version=self.version, tools=tools, objects=[each.name for each in _changing(spec)]
+        )
+        tasks = []
+        for frame in self.chosen(job):
+            products = [path for _, _, path in products_of(job, layout, frame) if not path.startswith("volumes/")]
+            points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+            tasks.append(
+                Task(
+                    id=TaskId(f"{self.name}/{frame:06d}"),
+                    stage=self.name,
+                    inputs=(*products, *points, *([layout.frame_cache(frame)] if _particles(job) else ())),
+                    outputs=(ArtifactPath(f"{FOLDER}/{frame:06d}.usdc"),),
+                    parameters=of_frames,
+                    frame=frame,
+                )
+            )
+        frames = self.chosen(job)
+        volumes = [
+            path for frame in frames for _, _, path in products_of(job, layout, frame) if path.startswith("volumes/")
+        ]
+        poses = [layout.frame_cache(frame) for frame in frames] if job.moving_bodies or job.placed_camera.moves else []
+        scene = Task(
+            id=TaskId(f"{self.name}/scene"),
+            stage=self.name,
+            inputs=(
+                *(task.outputs[0] for task in tasks),
+                *volumes,
+                *poses,
+                *(mesh for _, _, mesh in meshes_of(job)),
+                *(layout.product("cloths", cloth.name, frames[0], ".ply") for cloth in job.cloth),
+                *([layout.film_bounds()] if job.camera.frames_action else ()),
+            ),
+            outputs=(MANIFEST, self.root(job)),
+            parameters=ParameterSet.of(
+                stage=self.name,
+                version=self.version,
+                tools=tools,
+                spec=spec.model_dump(mode="json", exclude={"set", "lights"}),
+                camera=job.placed_camera.model_dump(mode="json"),
+            ),
+        )
+        return [*tasks, scene]
+
+    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
+        """No library of USD."""
+        if tool_version("usd-core") != "absent":
+            return []
+        return ["USD is written by the package usd-core; install it: pip install usd-core"]
+
+    def run(self, context: TaskContext) -> None:
+        """Write the layer of a frame, or the scene."""
+        if context.task.frame is None:
+            _write_scene(context)
+        else:
+            _write_frame(context, context.task.frame)
+        context.progress(1, 1)
+
+
+def _changing(spec: RenderSpec) -> list[MeshSequenceObject | PointSequenceObject]:
+    return [each for each in spec.objects if isinstance(each, MeshSequenceObject | PointSequenceObject)]
+
+
+def _particles(job: Job) -> Iterator[tuple[Kind, str, str]]:
+    """Bodies of points: their kind and name, and what their particles are called."""
+    for _, kind, body in bodies(job):
+        if kind.display.form == "points":
+            yield kind, body.name, f"{body.name}.particles"
+
+
+def _write_frame(context: TaskContext, frame: int) -> None:
+    job, layout = context.job, context.layout
+    meshes, points = {}, {}
+    for each in _changing(render_spec(job, layout)):
+        file = layout.root / each.file.replace("{frame}", f"{frame:06d}")
+        if isinstance(each, MeshSequenceObject):
+            meshes[each.name] = read_ply(file)
+            continue
+        cloud = read_point_cloud(file)
+        of_kind = cloud.kind == KINDS.index(each.kind)
+        radii = drawn_radii(cloud.radius[of_kind], cloud.lifetime[of_kind])
+        points[each.name] = Points(cloud.position[of_kind], cloud.velocity[of_kind], radii)
+    guides = {name: (kind, body) for kind, body, name in _particles(job)}
+    for name, (kind, body) in guides.items():
+        snapshot = read_compact(layout.path(layout.frame_cache(frame)), body)
+        arrays = snapshot.arrays
+        radius = snapshot.number(kind.display.radius)
+        points[name] = Points(
+            arrays["position"], arrays["velocity"], [radius] * len(arrays["position"]), arrays.get("particle_id")
+        )
+    with context.committing(context.task.outputs[0], validate_usd) as path:
+        write_usd_frame(path, frame, meshes=meshes, points=points, guides=list(guides))
+
+
+def _write_scene(context: TaskContext) -> None:
+    job, layout, task = context.job, context.layout, context.task
+    framed = framed_points(job, layout)
+    spec = render_spec(job, layout, framed)
+    layers = {frame_of(each): each for each in task.inputs if each.startswith(f"{FOLDER}/")}
+    meshes = {}
+    for each in spec.objects:
+        if isinstance(each, MeshObject | MovingMeshObject):
+            meshes[each.name] = read_ply(layout.root / each.file)
+        elif isinstance(each, MeshSequenceObject) and each.name in {cloth.name for cloth in job.cloth}:
+            meshes[each.name] = read_ply(layout.root / each.file.replace("{frame}", f"{min(layers):06d}"))
+    moving = [each for each in spec.objects if isinstance(each, MovingMeshObject)]
+    placements: dict[str, dict[int, Placement]] = {each.name: {} for each in moving}
+    path_of_camera = camera_path(job, framed)
+    views: dict[int, View] = {}
+    for frame in layers:
+        poses = {}
+        if job.moving_bodies:
+            cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies
+            poses = {name: cached[name].arrays for name in job.moving_bodies}
+        for each in moving:
+            pose = poses[each.body]
+            placements[each.name][frame] = Placement(pose["position"].tolist(), pose["orientation"].tolist())
+        if path_of_camera.moves or not views:
+            views[frame] = view_at(job, path_of_camera, frame, poses)
+        context.progress(len(views), len(layers), "camera and bodies")
+    with (
+        context.committing(MANIFEST, validate_usd) as manifest,
+        context.committing(task.outputs[1], validate_usd) as path,
+    ):
+        write_usd_scene(
+            path,
+            manifest,
+            spec,
+            frames=layers,
+            meshes=meshes,
+            placements=placements,
+            views=views,
+            guides={name: material_of(job, body) for _, body, name in _particles(job)},
+            manifest_name=MANIFEST,
+            first_layer=layout.path(layers[min(layers)]),
+        )
