@@ -37,7 +37,7 @@ def add_camera(parameters: dict[str, Any]) -> Any:
         camera.dof.use_dof = True
         camera.dof.aperture_fstop = parameters["f_stop"]
     blender_object = new_object("camera", camera)
-    _set_view(blender_object, parameters)
+    set_view(blender_object, parameters)
     bpy.context.scene.camera = blender_object
     return blender_object
 
@@ -49,7 +49,7 @@ def place_camera(blender_object: Any, path: Path, *, frame: int) -> None:
         forget_keyframes(animated)
     before = None
     for view in read_views(path):
-        _set_view(blender_object, view)
+        set_view(blender_object, view)
         orientation = blender_object.rotation_quaternion
         if before is not None and before.dot(orientation) < 0.0:
             blender_object.rotation_quaternion = -orientation  # the same, on the short way from the one before
@@ -75,7 +75,8 @@ def read_views(path: Path) -> list[dict[str, Any]]:
     return views
 
 
-def _set_view(blender_object: Any, view: dict[str, Any]) -> None:
+def set_view(blender_object: Any, view: dict[str, Any]) -> None:
+    """Put the camera where a view says."""
     position, look_at = Vector(view["position"]), Vector(view["look_at"])
     distance = max((look_at - position).length, _NEAREST_M)
     aim(blender_object, position, look_at)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ GROUPS = {
     "normals": ("nx", "ny", "nz"),
     "velocities": ("vx", "vy", "vz"),
     "uv": ("s", "t"),
+    "wet": ("wet",),
 }
 """Columns of vertices by the names of their arrays, in the order that files have them."""
 _LONGEST_HEADER = 4096
@@ -58,6 +60,7 @@ class SurfaceMesh:
         normals: (n, 3) float32 unit vectors that point out, or None.
         velocities: (n, 3) float32 [m/s], or None.
         uv: (n, 2) float32 coordinates on the surface at rest [m], or None.
+        wet: (n, 1) float32, how far a fluid's vertices touch solids: 1 where they do, 0 where they are free; or None.
         corner_uv: (m, 3, 2) float32 coordinates on pictures, of the corners of faces, or None.
     """
 
@@ -66,6 +69,7 @@ class SurfaceMesh:
     normals: NDArray[np.float32] | None = None
     velocities: NDArray[np.float32] | None = None
     uv: NDArray[np.float32] | None = None
+    wet: NDArray[np.float32] | None = None
     corner_uv: NDArray[np.float32] | None = None
 
 
@@ -122,6 +126,27 @@ def read_mesh(content: bytes) -> SurfaceMesh:
         corner_uv=np.ascontiguousarray(records["corner_uv"], np.float32) if is_textured else None,
         **{group: np.ascontiguousarray(rows[:, columns], np.float32) for group, columns in header.groups()},
     )
+
+
+def write_mesh(path: Path, mesh: SurfaceMesh) -> None:
+    """Write a mesh; the same arrays give the same bytes."""
+    columns = {name: getattr(mesh, name) for name in GROUPS if getattr(mesh, name) is not None}
+    properties = tuple(name for group in columns for name in GROUPS[group])
+    face = FACE if mesh.corner_uv is None else TEXTURED_FACE
+    header = MeshHeader(len(mesh.vertices), len(mesh.faces), properties, face)
+    rows = np.empty((header.vertex_count, len(properties)), "<f4")
+    for name, places in header.groups():
+        rows[:, places] = columns[name]
+    records = np.empty(len(mesh.faces), face)
+    records["count"] = 3
+    records["indices"] = mesh.faces
+    if mesh.corner_uv is not None:
+        records["uv_count"] = 6
+        records["corner_uv"] = mesh.corner_uv
+    with path.open("wb") as file:
+        file.write(header.content)
+        file.write(rows.data)
+        file.write(records.data)
 
 
 def require_sound_mesh(mesh: SurfaceMesh) -> None:

@@ -3,7 +3,8 @@
     blender --background --factory-startup --python render_frames.py -- SPEC --threads 4 --gpu none
 
 Frames are asked for on standard input, one `12 /path` a line (after a tab, the path of the EXR that is wanted too);
-`set 12 96x54 /path` asks for the empty set of a frame at that resolution. The answers are lines of standard output,
+`set 12 96x54 /path` asks for the empty set of a frame at that resolution, `surfaces 12 /folder` for its fluids as they
+are drawn. The answers are lines of standard output,
 among those that Blender itself writes: first `PICTURES_BY_UV ["object", ...]`, see SceneRenderer, and
 `RENDERER_READY version device`, or `RENDERER_FAILED reason`; then for each frame `FRAME_DONE 12 /path` or `FRAME_FAILED
 12 reason`. The process ends with its input, so it cannot outlive who started it.
@@ -17,6 +18,8 @@ import os
 import queue
 import sys
 import threading
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -26,6 +29,7 @@ if __package__ in (None, ""):
     sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 import bpy
+import numpy as np
 
 from blender_scripts import (
     blend_materials,
@@ -49,7 +53,7 @@ from blender_scripts.compatibility import blender_version, require_supported_ver
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
 from blender_scripts.look_table import LOOK_TABLE
-from blender_scripts.ply import SurfaceMesh
+from blender_scripts.ply import SurfaceMesh, write_mesh
 from blender_scripts.shading import LookContext, SmokeBox
 from blender_scripts.smoke_looks import glow_of
 
@@ -145,6 +149,20 @@ class SceneRenderer:
         self._place_camera(frame)
         self._draw(frame, output_path, master_path)
 
+    def save_surfaces(self, frame: int, folder: Path) -> None:
+        """Write the surfaces of fluids as they are drawn at a frame, with where they touch solids: NAME.ply each.
+
+        Raises as `render` does.
+        """
+        self._require_current()
+        sheets = [
+            geometry.read_ply(self._file(description["file"], frame))
+            for description, _ in self._sequences
+            if description["type"] == "mesh_sequence" and self._is_touched(description)
+        ]
+        for description, _, mesh, wetness in self._wetted(frame, self._read_places(frame), sheets):
+            write_mesh(folder / f"{description['name']}.ply", replace(mesh, wet=wetness[:, None]))
+
     def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what a frame's camera sees without any body: ground, backdrop, tank and their light, in another size.
 
@@ -197,19 +215,32 @@ class SceneRenderer:
 
     def _place_bodies(self, frame: int) -> dict[str, poses.Pose]:
         """Put the bodies that move where they are; returns where, by the name of the object."""
+        places = self._read_places(frame)
+        for description, blender_object in self._bodies:
+            poses.place(blender_object, places[description["name"]], frame=frame)
+        return places
+
+    def _read_places(self, frame: int) -> dict[str, poses.Pose]:
+        """Where the bodies are that move, by the name of the object."""
         of_file: dict[Path, dict[str, poses.Pose]] = {}
         places = {}
-        for description, blender_object in self._bodies:
+        for description, _ in self._bodies:
             path = self._file(description["poses"], frame)
             if path not in of_file:
                 of_file[path] = poses.read_poses(path)
             if description["body"] not in of_file[path]:
                 raise RenderInputError(f'the poses {path} have none of "{description["body"]}"')
             places[description["name"]] = of_file[path][description["body"]]
-            poses.place(blender_object, places[description["name"]], frame=frame)
         return places
 
     def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[SurfaceMesh]) -> None:
+        for _, blender_object, mesh, wetness in self._wetted(frame, places, sheets):
+            geometry.fill_mesh(blender_object.data, mesh, wetness)
+
+    def _wetted(
+        self, frame: int, places: dict[str, poses.Pose], sheets: list[SurfaceMesh]
+    ) -> Iterator[tuple[dict[str, Any], Any, SurfaceMesh, np.ndarray]]:
+        """Every fluid with its surface, and how far each vertex of that touches something."""
         solids = [wetting.Touchable.of(sheet, is_closed=False) for sheet in sheets]
         for description, body in self._touched:
             pose = places.get(description["name"])
@@ -228,14 +259,18 @@ class SceneRenderer:
             mesh, wetness = wetting.wetted(
                 surface, reach=reach, floor_z=self._floor_z, touchables=touchables, dips=dips
             )
-            geometry.fill_mesh(blender_object.data, mesh, wetness)
+            yield description, blender_object, mesh, wetness
 
     def _place_camera(self, frame: int) -> None:
         if self._views is None:
             return
         camera.place_camera(self._camera, self._file(self._views, frame), frame=frame)
         # A pattern that stood still in a moving picture would look like dirt on the lens.
-        bpy.context.scene.cycles.seed = (self._seed + frame) % 2**31
+        bpy.context.scene.cycles.seed = self.seed_of(frame)
+
+    def seed_of(self, frame: int) -> int:
+        """The pattern of samples of a frame that a moving camera sees."""
+        return int((self._seed + frame) % 2**31)
 
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> Any:
         name, kind = description["name"], description["type"]
@@ -345,14 +380,18 @@ def _serve(renderer: SceneRenderer) -> NoReturn:
 
 def _answer(renderer: SceneRenderer, request: str) -> None:
     """Draw what is asked for, and report the result."""
-    empty_set = request.startswith("set ")
-    if empty_set:
+    empty_set, surfaces = request.startswith("set "), request.startswith("surfaces ")
+    if surfaces:
+        _, frame, path = request.split(" ", 2)
+    elif empty_set:
         _, frame, size, path = request.split(" ", 3)
     else:
         frame, _, paths = request.partition(" ")
         path, _, master_path = paths.partition("\t")
     try:
-        if empty_set:
+        if surfaces:
+            renderer.save_surfaces(int(frame), Path(path))
+        elif empty_set:
             width, height = map(int, size.split("x"))
             renderer.render_set(int(frame), Path(path), resolution=(width, height))
         else:

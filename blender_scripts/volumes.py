@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +46,21 @@ def load_volume(volume: Any, path: Path) -> None:
         volume.velocity_grid = "velocity"
 
 
+def play(volume: Any, file: str, frames: Sequence[int]) -> None:
+    """Let a volume play the files of frames; `file` has {frame} in it."""
+    first, last = min(frames), max(frames)
+    volume.filepath = file.replace("{frame}", f"{first:06d}")
+    volume.is_sequence = True
+    # Blender shows file number `frame - frame_start + 1 + frame_offset`.
+    volume.frame_start, volume.frame_offset, volume.frame_duration = first, first - 1, last - first + 1
+
+
 class FireLight:
     """The lamps of one fire, which shine as its volume glows, frame by frame."""
 
     def __init__(self, name: str, glow: Glow) -> None:
         self._name, self._glow = name, glow
-        self._lamps: list[Any] = []
+        self.lamps: list[Any] = []
 
     def shine(self, path: Path) -> None:
         """Set the lamps to the light of this frame's volume.
@@ -59,9 +69,9 @@ class FireLight:
             RenderInputError: the volume lacks a grid.
         """
         lamps = lamps_of_file(path, self._glow)
-        while len(self._lamps) < len(lamps):
-            self._lamps.append(self._new_lamp())
-        for index, blender_object in enumerate(self._lamps):
+        while len(self.lamps) < len(lamps):
+            self.lamps.append(self._new_lamp())
+        for index, blender_object in enumerate(self.lamps):
             blender_object.hide_render = index >= len(lamps)
             if index < len(lamps):
                 _set_lamp(blender_object, lamps[index])

@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 from render.blender import early_end, run_script, script_argv
 from render.errors import InvalidFileError
+from render.suffixed import read_as, written_as
 
 _TIMEOUT_S = 120.0
+_SCENE_S, _SCENE_S_PER_FRAME = 300.0, 5.0  # lamps of fires take a look at each frame's volume
 
 
 class Texture(NamedTuple):
@@ -37,6 +39,32 @@ def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str]
         InvalidFileError: the file cannot be read, or a material that is tried needs more than is in the file.
     """
     return [str(name) for name in json.loads(_ask(path, blender, tried, "MATERIALS"))]
+
+
+def write_scene_file(path: Path, spec: Path, frames: Sequence[int], blender: str | None) -> None:
+    """Write the scene of a RenderSpec document as a .blend file that plays these frames.
+
+    Raises:
+        BlenderUnavailableError: Blender does not answer.
+        InvalidFileError: a file of a frame is missing or unfit.
+    """
+    with written_as(path, ".blend") as named:
+        argv = script_argv(blender, "scene_file.py", [str(spec.resolve()), json.dumps(list(frames)), str(named)])
+        purpose = "write the scene"
+        completed = run_script(argv, timeout_s=_SCENE_S + _SCENE_S_PER_FRAME * len(frames), purpose=purpose)
+        if "\nSCENE_SAVED" in f"\n{completed.stdout}":
+            return
+        refused = [line for line in completed.stdout.splitlines() if line.startswith("SCENE_FAILED ")]
+        raise InvalidFileError(
+            spec, refused[0].partition(" ")[2] if refused else early_end(completed, "wrote the scene")
+        )
+
+
+def validate_scene_file(path: Path, blender: str | None) -> None:
+    """Let Blender read a .blend file. Raises InvalidFileError: it cannot, or there is no material in it."""
+    with read_as(path, ".blend") as named:
+        if not read_material_names(named, blender):
+            raise InvalidFileError(path, "has no material, as any scene has")
 
 
 def _ask(path: Path, blender: str | None, tried: Sequence[str], wanted: str) -> str:

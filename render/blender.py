@@ -135,6 +135,11 @@ class ModuleRenderer:
         with _errors_of(frame):
             self._scene.render_set(frame, output_path, resolution=resolution)
 
+    def save_surfaces(self, frame: int, folder: Path) -> None:
+        """Write the surfaces of fluids as they are drawn at a frame, NAME.ply each. Raises FrameRenderError."""
+        with _errors_of(frame):
+            self._scene.save_surfaces(frame, folder)
+
     def close(self) -> None:
         """Nothing to do: the module stays loaded, and the next scene replaces this one."""
 
@@ -181,6 +186,10 @@ class ChildRenderer:
         """Draw the view of a frame's camera without any body. Raises as `render` does."""
         width, height = resolution
         self._ask(frame, f"set {frame} {width}x{height} {output_path.resolve()}")
+
+    def save_surfaces(self, frame: int, folder: Path) -> None:
+        """Write the surfaces of fluids as they are drawn at a frame, NAME.ply each. Raises as `render` does."""
+        self._ask(frame, f"surfaces {frame} {folder.resolve()}")
 
     def _ask(self, frame: int, request: str) -> None:
         stdin = self._process.stdin

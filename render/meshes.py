@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blender_scripts.ply import FACE, GROUPS, TEXTURED_FACE, MeshHeader, SurfaceMesh, read_mesh, require_sound_mesh
+from blender_scripts.ply import GROUPS, SurfaceMesh, read_mesh, require_sound_mesh, write_mesh
 from render.errors import invalid_if_refused
 
 __all__ = ["Float32Array", "SurfaceMesh", "read_ply", "validate_ply", "write_ply"]
@@ -36,25 +36,10 @@ def write_ply(
     counts = {name: len(column) for name, column in columns.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"a mesh needs as many of each per vertex, got {counts}")
-    properties = tuple(name for group in columns for name in GROUPS[group])
-    face = FACE if corner_uv is None else TEXTURED_FACE
-    header = MeshHeader(counts["vertices"], len(triangles), properties, face)
-    rows = np.empty((header.vertex_count, len(properties)), "<f4")
-    for name, places in header.groups():
-        rows[:, places] = columns[name]
-    records = np.empty(len(triangles), face)
-    records["count"] = 3
-    records["indices"] = triangles
-    if corner_uv is not None:
-        coordinates = np.asarray(corner_uv)
-        if coordinates.shape != (len(triangles), 3, 2):
-            raise ValueError(f"corner_uv must have the shape ({len(triangles)}, 3, 2), got {coordinates.shape}")
-        records["uv_count"] = 6
-        records["corner_uv"] = coordinates
-    with path.open("wb") as file:
-        file.write(header.content)
-        file.write(rows.data)
-        file.write(records.data)
+    if corner_uv is not None and np.shape(corner_uv) != (len(triangles), 3, 2):
+        raise ValueError(f"corner_uv must have the shape ({len(triangles)}, 3, 2), got {np.shape(corner_uv)}")
+    coordinates = None if corner_uv is None else np.asarray(corner_uv)
+    write_mesh(path, SurfaceMesh(**columns, faces=triangles, corner_uv=coordinates))
 
 
 def read_ply(path: Path) -> SurfaceMesh:

@@ -26,7 +26,7 @@ from pipeline.queue.submitting import QueueOptions
 if TYPE_CHECKING:
     from pipeline.stages.export import ExportStage
 
-FORMATS = ("vtk", "usd")
+FORMATS = ("vtk", "usd", "blend")
 """As the stages have them, which are too heavy to be imported for `--help`."""
 OPENJD = "openjd"
 

@@ -61,9 +61,7 @@ class ExportStage(Stage):
     def belonging(self, tasks: list[Task]) -> list[ArtifactPath]:
         """What has to lie together for the export to be whole, the file to open last."""
         mine = [task for task in tasks if task.stage == self.name]
-        shown = [
-            artifact for task in mine for artifact in task.inputs if PurePosixPath(artifact).parts[0] in self.refers_to
-        ]
+        shown = [each for each in mine[-1].inputs if PurePosixPath(each).parts[0] in self.refers_to]
         return [*dict.fromkeys([*shown, *(output for task in mine for output in task.outputs)])]
 
 

@@ -57,7 +57,7 @@ class RenderStage(Stage):
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
         drawn = render_spec(job, layout)
-        spec = _decisive(drawn)
+        spec = decisive(drawn)
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
             spec["camera"] = {"framing": job.placed_camera.model_dump(mode="json")}
@@ -189,7 +189,7 @@ def _missing_materials(job: Job) -> Iterator[str]:
                 yield f'material.{body}.blend: {file} has no material "{name}"{hint}; {known}'
 
 
-def _decisive(spec: RenderSpec) -> dict[str, Any]:
+def decisive(spec: RenderSpec) -> dict[str, Any]:
     """The part of a specification that decides pixels, files named by their content.
 
     Raises MissingInputError: a file cannot be read.
