@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,7 +32,9 @@ def write_ply(
         ValueError: the shapes do not fit together.
     """
     groups = {"vertices": vertices, "normals": normals, "velocities": velocities, "uv": uv}
-    columns = {name: _as_rows(name, value, len(GROUPS[name])) for name, value in groups.items() if value is not None}
+    columns: dict[str, Any] = {
+        name: _as_rows(name, value, len(GROUPS[name])) for name, value in groups.items() if value is not None
+    }
     triangles = _as_rows("faces", faces, 3)
     counts = {name: len(column) for name, column in columns.items()}
     if len(set(counts.values())) > 1:
@@ -65,7 +68,7 @@ def validate_ply(path: Path) -> None:
         require_sound_mesh(mesh)
 
 
-def _as_rows(name: str, values: ArrayLike, width: int) -> NDArray[np.generic]:
+def _as_rows(name: str, values: ArrayLike, width: int) -> NDArray[Any]:
     rows = np.asarray(values)
     if rows.size == 0:
         return rows.reshape(0, width)

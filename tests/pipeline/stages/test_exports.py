@@ -1,0 +1,288 @@
+"""Exports, read by the libraries of the programs that they are for."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from exported_jobs import FRAMES, simulated
+from films import Studio
+from places import PROJECT
+
+from pipeline.store.cache import read_frame
+from render.errors import InvalidFileError
+from render.meshes import read_ply
+from render.pictures import read_picture
+from render.point_clouds import KINDS, read_point_cloud
+from render.usd_files import validate_usd
+from render.vtk_files import validate_vtk
+
+pytestmark = pytest.mark.slow
+
+LAST = FRAMES - 1
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory) -> Studio:
+    return simulated(tmp_path_factory.mktemp("studio"))
+
+
+@pytest.fixture(scope="module")
+def vtk(studio) -> Studio:
+    studio.run("export", "tiny", "--to", "vtk").assert_code(0)
+    return studio
+
+
+@pytest.fixture(scope="module")
+def usd(studio) -> Studio:
+    studio.run("export", "tiny", "--to", "usd").assert_code(0)
+    return studio
+
+
+@pytest.fixture(scope="module")
+def blend(studio) -> Studio:
+    studio.run("export", "tiny", "--to", "blend").assert_code(0)
+    return studio
+
+
+def cached(studio: Studio, body: str, frame: int) -> Any:
+    return read_frame(studio.layout.path(studio.layout.frame_cache(frame)), body).bodies[body]
+
+
+def surface(studio: Studio, frame: int) -> Any:
+    return read_ply(studio.layout.path(studio.layout.surface("water", frame)))
+
+
+def whitewater(studio: Studio, frame: int) -> Any:
+    return read_point_cloud(studio.layout.path(studio.layout.whitewater("water", frame)))
+
+
+# --- ParaView ---
+
+
+def blocks_of(path: Path) -> dict[str, Any]:
+    from vtkmodules.vtkIOXML import vtkXMLMultiBlockDataReader
+
+    reader = vtkXMLMultiBlockDataReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    frame = reader.GetOutput()
+    names = [frame.GetMetaData(index).Get(frame.NAME()) for index in range(frame.GetNumberOfBlocks())]
+    return {name: frame.GetBlock(index) for index, name in enumerate(names)}
+
+
+def array(data: Any, name: str) -> np.ndarray:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    return vtk_to_numpy(data.GetArray(name))
+
+
+def points(block: Any) -> np.ndarray:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    return vtk_to_numpy(block.GetPoints().GetData())
+
+
+def test_vtk_reads_what_the_cache_has(vtk):
+    blocks = blocks_of(vtk.layout.root / f"vtk/{LAST:06d}.vtm")
+    names = {"ball", "duck", "water", "water.surface", "water.whitewater", "sheet", "plume"}
+    assert blocks.keys() == names
+    for body in ("water", "sheet"):
+        there = cached(vtk, body, LAST).arrays
+        np.testing.assert_array_equal(points(blocks[body]), there["position"])
+        np.testing.assert_array_equal(array(blocks[body].GetPointData(), "velocity"), there["velocity"])
+    mesh, cloud = surface(vtk, LAST), whitewater(vtk, LAST)
+    assert blocks["water.surface"].GetNumberOfCells() == len(mesh.faces)
+    np.testing.assert_array_equal(array(blocks["water.surface"].GetPointData(), "velocity"), mesh.velocities)
+    np.testing.assert_array_equal(array(blocks["water.whitewater"].GetPointData(), "kind"), cloud.kind)
+
+
+def test_vtk_reads_the_grid_of_smoke_with_x_first(vtk):
+    block = blocks_of(vtk.layout.root / f"vtk/{LAST:06d}.vtm")["plume"]
+    smoke = cached(vtk, "plume", LAST)
+    i0, i1, j0, j1, k0, k1 = block.GetExtent()
+    box = (slice(i0, i1), slice(j0, j1), slice(k0, k1))
+    np.testing.assert_allclose(block.GetOrigin(), smoke.attributes["origin"])
+    np.testing.assert_allclose(block.GetSpacing(), [smoke.attributes["cell_size"]] * 3)
+    shape = smoke.arrays["density"][box].shape
+    for name in ("density", "temperature", "velocity"):
+        own = smoke.arrays[name][box]
+        there = array(block.GetCellData(), name).reshape(*shape[::-1], *own.shape[3:])
+        np.testing.assert_array_equal(there.swapaxes(0, 2), own)
+
+
+def test_vtk_reads_units_and_times(vtk):
+    from vtkmodules.vtkCommonCore import vtkDataArray
+
+    blocks = blocks_of(vtk.layout.root / f"vtk/{LAST:06d}.vtm")
+
+    def unit(values: Any) -> str:
+        return values.GetInformation().Get(vtkDataArray.UNITS_LABEL())
+
+    units = {name: unit(blocks["water"].GetPointData().GetArray(name)) for name in ("velocity", "density", "pressure")}
+    assert units == {"velocity": "m/s", "density": "kg/m3", "pressure": "Pa"}
+    assert unit(blocks["plume"].GetCellData().GetArray("temperature")) == "K"
+    assert array(blocks["water"].GetFieldData(), "TimeValue") == pytest.approx([LAST / 60])
+
+
+def test_vtk_has_bodies_where_they_are(vtk):
+    block = blocks_of(vtk.layout.root / f"vtk/{LAST:06d}.vtm")["ball"]
+    pose = cached(vtk, "ball", LAST).arrays
+    np.testing.assert_allclose(points(block).mean(axis=0), pose["position"], atol=1e-4)
+    speeds = array(block.GetPointData(), "velocity")
+    np.testing.assert_allclose(speeds.mean(axis=0), pose["velocity"], atol=1e-3)
+
+
+@pytest.mark.parametrize("place", [0.3, 0.6, 0.95])
+def test_a_damaged_vtk_file_is_refused(vtk, tmp_path, place):
+    content = bytearray((vtk.layout.root / f"vtk/water/{LAST:06d}.vtp").read_bytes())
+    path = tmp_path / "damaged.vtp"
+    path.write_bytes(content[: int(place * len(content))])
+    with pytest.raises(InvalidFileError):
+        validate_vtk(path)
+
+
+# --- USD ---
+
+
+def test_usd_is_in_metres_z_up_and_passes_its_own_validators(usd):
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    stage = Usd.Stage.Open(str(usd.layout.root / "tiny.usd"))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, LAST, 60)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 20
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [each.GetErrorAsString() for each in errors] == []
+
+
+def test_usd_plays_what_the_cache_has(usd):
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(usd.layout.root / "tiny.usd"))
+    for frame in (0, LAST):
+        mesh, made = surface(usd, frame), UsdGeom.Mesh.Get(stage, "/World/water")
+        np.testing.assert_array_equal(np.array(made.GetPointsAttr().Get(frame)), mesh.vertices)
+        np.testing.assert_array_equal(np.array(made.GetVelocitiesAttr().Get(frame)), mesh.velocities)
+        indices = made.GetFaceVertexIndicesAttr().Get(frame)
+        np.testing.assert_array_equal(np.array(indices), mesh.faces.ravel())
+        assert UsdGeom.Mesh.ValidateTopology(indices, made.GetFaceVertexCountsAttr().Get(frame), len(mesh.vertices))[0]
+        sheet, cloth = UsdGeom.Mesh.Get(stage, "/World/sheet"), cached(usd, "sheet", frame).arrays
+        np.testing.assert_array_equal(np.array(sheet.GetPointsAttr().Get(frame)), cloth["position"])
+        np.testing.assert_array_equal(np.array(sheet.GetVelocitiesAttr().Get(frame)), cloth["velocity"])
+        cloud = whitewater(usd, frame)
+        spray = UsdGeom.Points.Get(stage, "/World/water_spray")
+        is_spray = cloud.kind == KINDS.index("spray")
+        assert len(spray.GetPointsAttr().Get(frame)) == is_spray.sum()
+        assert (np.array(spray.GetWidthsAttr().Get(frame)) <= 2.0 * cloud.radius[is_spray] + 1e-9).all()
+
+
+def test_usd_moves_bodies_and_names_volumes_by_relative_paths(usd):
+    from pxr import Usd, UsdGeom, UsdShade, UsdVol
+
+    stage = Usd.Stage.Open(str(usd.layout.root / "tiny.usd"))
+    ball = UsdGeom.Xformable.Get(stage, "/World/ball")
+    for frame in range(FRAMES):
+        place = ball.ComputeLocalToWorldTransform(frame).ExtractTranslation()
+        np.testing.assert_allclose(place, cached(usd, "ball", frame).arrays["position"], atol=1e-6)
+    assert UsdGeom.Mesh(ball).GetPointsAttr().GetNumTimeSamples() == 0  # its mesh is there once
+    file = UsdVol.OpenVDBAsset.Get(stage, "/World/plume/density").GetFilePathAttr().Get(LAST)
+    assert file.path == f"./volumes/plume/{LAST:06d}.vdb"
+    assert Path(file.resolvedPath).is_file()
+    material, _ = UsdShade.MaterialBindingAPI(ball).ComputeBoundMaterial()
+    assert material.ComputeSurfaceSource()[0].GetIdAttr().Get() == "UsdPreviewSurface"
+
+
+def test_the_same_usd_has_the_same_bytes(usd):
+    names = ["tiny.usd", "usd/manifest.usda", f"usd/{LAST:06d}.usdc"]
+    before = [(usd.layout.root / name).read_bytes() for name in names]
+    usd.run("rerun", "tiny", "--stage", "export-usd").assert_code(0)
+    assert [(usd.layout.root / name).read_bytes() for name in names] == before
+
+
+def test_a_truncated_usd_layer_is_refused(usd, tmp_path):
+    content = (usd.layout.root / f"usd/{LAST:06d}.usdc").read_bytes()
+    path = tmp_path / "damaged.usdc"
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InvalidFileError):
+        validate_usd(path)
+
+
+# --- Blender ---
+
+DRAW = """
+import sys, bpy
+file, frame, picture = sys.argv[1:]
+bpy.ops.wm.open_mainfile(filepath=file)
+bpy.context.scene.frame_set(int(frame))
+bpy.context.scene.render.image_settings.file_format = "PNG"
+bpy.context.scene.render.filepath = picture
+bpy.ops.render.render(write_still=True)
+"""
+
+
+def test_the_blend_file_given_away_draws_the_films_frame(blend, tmp_path):
+    target = tmp_path / "given"
+    blend.run("export", "tiny", "--to", "blend", "-o", str(target)).assert_code(0)
+    blend.submit("--until", f"render:{LAST}")
+    own = blend.layout.path(blend.layout.picture(LAST))
+    assert not blend.layout.path(blend.layout.picture(0)).exists()
+    picture = tmp_path / "blend.png"
+    argv = [sys.executable, "-c", DRAW, str(target / "tiny.blend"), str(LAST), str(picture)]
+    subprocess.run(argv, check=True, capture_output=True, cwd=PROJECT)
+    film, drawn = (read_picture(path)[..., :3].astype(float) / 255.0 for path in (own, picture))
+    # Measured 0.0003: normals of imported surfaces are rounded. Without the whitewater it is 0.01.
+    assert np.abs(film - drawn).mean() < 0.002
+
+
+# --- exports as stages ---
+
+
+def test_an_export_is_made_once_and_frames_can_be_chosen(vtk):
+    vtk.run("export", "tiny", "--to", "vtk").assert_code(0)  # of the tasks on record, too
+    before = vtk.attempts()
+    ended = vtk.run("export", "tiny", "--to", "vtk").assert_code(0)
+    assert "up to date" in ended.out
+    assert vtk.tasks_run_since(before) == set()
+    ended = vtk.run("export", "tiny", "--to", "vtk", "--frames", "1-2").assert_code(0)
+    assert "2 frames (1-2)" in ended.out
+    assert vtk.tasks_run_since(before) == {"export-vtk/series"}
+    series = (vtk.layout.root / "tiny.pvd").read_text()
+    assert [f"{frame:06d}.vtm" in series for frame in range(FRAMES)] == [False, True, True, False]
+    vtk.run("export", "tiny", "--to", "vtk").assert_code(0)
+
+
+def test_what_is_given_away_is_whole_and_copied_once(usd, tmp_path):
+    from pxr import Usd, UsdUtils
+
+    target = tmp_path / "given"
+    usd.run("export", "tiny", "--to", "usd", "-o", str(target)).assert_code(0)
+    _, _, missing = UsdUtils.ComputeAllDependencies(str(target / "tiny.usd"))
+    assert missing == []
+    assert Usd.Stage.Open(str(target / "tiny.usd")).GetPrimAtPath("/World/water")
+    again = usd.run("export", "tiny", "--to", "usd", "-o", str(target)).assert_code(0)
+    assert "0 of" in again.err
+
+
+def test_the_film_is_untouched_by_exports_and_they_by_cleaning(vtk, tmp_path):
+    copy = vtk.copy(tmp_path / "copy")
+    copy.run("clean", "tiny", "--superseded", "--yes").assert_code(0)
+    assert (copy.layout.root / "tiny.pvd").is_file()
+    assert "render" in copy.run("plan", "tiny").assert_code(0).out
+    assert "export" not in copy.run("plan", "tiny").out
+
+
+def test_a_frame_that_is_not_there_and_a_busy_job_are_refused(vtk, tmp_path):
+    ended = vtk.run("export", "tiny", "--to", "vtk", "--frames", f"0-{FRAMES}")
+    assert ended.code != 0
+    assert f"no frame {FRAMES}" in ended.err
+    shutil.rmtree(tmp_path, ignore_errors=True)
+    assert vtk.run("export", "tiny", "--to", "openjd", "--frames", "1").code == 2
+    assert vtk.run("export", "tiny", "--to", "vtk", "--python", "x").code == 2
