@@ -1,11 +1,11 @@
-"""The whole scene of a job as a .blend file, which plays the job's own files by relative paths.
+"""The whole scene of a job as a .blend file, which plays the job's own files by relative paths; its meshes as Alembic.
 
     blender --background --factory-startup --python scene_file.py -- SPEC FRAMES FILE
 
-SPEC is the RenderSpec document in the job's folder, which the file is meant for, FRAMES a JSON list of frame numbers
-whose poses and views are there. Meshes and points are imported by geometry nodes, frame by frame; places of bodies and
-camera, and the lamps of fires, are keyframes. No script is in the file. A line `SCENE_SAVED` or `SCENE_FAILED reason`
-ends what is written.
+SPEC is the RenderSpec document in the job's folder, which a .blend file is meant for, FRAMES a JSON list of frame
+numbers whose poses and views are there, FILE ends in .blend or .abc. Meshes and points are imported by geometry nodes,
+frame by frame; places of bodies and camera, and the lamps of fires, are keyframes. No script is in the file. A line
+`SCENE_SAVED` or `SCENE_FAILED reason` ends what is written.
 """
 
 from __future__ import annotations
@@ -34,21 +34,15 @@ WET_FILES = "blend/{name}/{{frame}}.ply"  # of fluids, with where they touch sol
 class SceneFile(SceneRenderer):
     """A scene that is saved instead of drawn."""
 
-    def save(self, frames: Sequence[int], path: Path) -> None:
+    def save_blend(self, frames: Sequence[int], path: Path) -> None:
         """Let the scene play these frames, and write it.
 
         Raises:
             RenderInputError: a file of a frame is missing or unfit.
         """
-        scene = bpy.context.scene
-        bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
-        for description, blender_object in [*self._sequences, *self._fluids]:
-            self._play(description, blender_object, frames)
-        self._animate_bodies(frames)
-        self._animate_camera(frames)
+        self._animate(frames, "//", WET_FILES)
         self._animate_fires(frames)
-        scene.frame_start, scene.frame_end = min(frames), max(frames)
-        scene.frame_set(min(frames))
+        scene = bpy.context.scene
         scene.render.threads_mode = "AUTO"
         scene.render.filepath = "//"
         for image in bpy.data.images:
@@ -56,20 +50,48 @@ class SceneFile(SceneRenderer):
                 image.pack()
         bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=True, relative_remap=False)
 
-    def _play(self, description: dict[str, Any], blender_object: Any, frames: Sequence[int]) -> None:
+    def save_alembic(self, frames: Sequence[int], path: Path) -> None:
+        """Write bodies, surfaces, cloths, whitewater as loose points, and the camera. Raises as `save_blend` does."""
+        self._animate(frames, f"{self._folder}/", None)
+        for blender_object in bpy.data.objects:
+            is_drawn = blender_object.name not in self._of_set and blender_object.type == "MESH"
+            blender_object.select_set(is_drawn or blender_object == self._camera)
+            if "spheres" in blender_object.modifiers:
+                blender_object.modifiers.remove(blender_object.modifiers["spheres"])
+        bpy.ops.wm.alembic_export(
+            filepath=str(path),
+            start=min(frames),
+            end=max(frames),
+            selected=True,
+            export_hair=False,
+            as_background_job=False,
+        )
+
+    def _animate(self, frames: Sequence[int], base: str, wet_files: str | None) -> None:
+        """Let the scene play these frames, from files whose paths begin with `base`."""
+        scene = bpy.context.scene
+        bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
+        for description, blender_object in self._sequences:
+            self._play(description, blender_object, frames, base + description["file"])
+        for description, blender_object in self._fluids:
+            file = wet_files.format(name=description["name"]) if wet_files else description["file"]
+            self._play(description, blender_object, frames, base + file)
+        self._animate_bodies(frames)
+        self._animate_camera(frames)
+        scene.frame_start, scene.frame_end = min(frames), max(frames)
+        scene.frame_set(min(frames))
+
+    def _play(self, description: dict[str, Any], blender_object: Any, frames: Sequence[int], file: str) -> None:
         if description["type"] == "volume_sequence":
             volumes.load_volume(blender_object.data, self._file(description["file"], min(frames)))
-            volumes.play(blender_object.data, f"//{description['file']}", frames)
-        elif description["type"] == "point_sequence":
-            group = _points_of_frame(blender_object, description)
-            modifier = blender_object.modifiers.new("frames", "NODES")
-            modifier.node_group = group
+            volumes.play(blender_object.data, file, frames)
+            return
+        modifier = blender_object.modifiers.new("frames", "NODES")
+        if description["type"] == "point_sequence":
+            modifier.node_group = _points_of_frame(blender_object, file, description["kind"])
             blender_object.modifiers.move(len(blender_object.modifiers) - 1, 0)
         else:
             geometry.fill_mesh(blender_object.data, geometry.EMPTY_MESH)
-            is_fluid = any(blender_object is each for _, each in self._fluids)
-            file = WET_FILES.format(name=description["name"]) if is_fluid else description["file"]
-            modifier = blender_object.modifiers.new("frames", "NODES")
             modifier.node_group = _mesh_of_frame(blender_object, file)
 
     def _animate_bodies(self, frames: Sequence[int]) -> None:
@@ -166,12 +188,12 @@ class _Nodes:
         return made
 
     def imported(self, file: str) -> Any:
-        """The geometry of a PLY file, whose path below the .blend file's folder has {frame} in it."""
+        """The geometry of a PLY file, whose path has {frame} in it."""
         time = self.node("GeometryNodeInputSceneTime")
         frame = self.node("FunctionNodeFloatToInt", time.outputs["Frame"], rounding_mode="ROUND")
         text = self.node("FunctionNodeFormatString")
         text.format_items.new("INT", "frame")
-        text.inputs["Format"].default_value = "//" + file.replace("{frame}", "{frame:06}")
+        text.inputs["Format"].default_value = file.replace("{frame}", "{frame:06}")
         self.group.links.new(frame.outputs[0], text.inputs["frame"])
         return self.node("GeometryNodeImportPLY", text.outputs[0]).outputs[0]
 
@@ -210,14 +232,14 @@ def _mesh_of_frame(blender_object: Any, file: str) -> Any:
     return nodes.end(nodes.node("GeometryNodeSetMaterial", mesh, None, material).outputs[0])
 
 
-def _points_of_frame(blender_object: Any, description: dict[str, Any]) -> Any:
+def _points_of_frame(blender_object: Any, file: str, kind: str) -> Any:
     """The points of one kind, with the radius that they have at the end of their life."""
     nodes = _Nodes(blender_object.name)
-    points = nodes.with_velocity(nodes.imported(description["file"]))
+    points = nodes.with_velocity(nodes.imported(file))
     is_other = nodes.node(
         "FunctionNodeCompare",
         nodes.named("kind"),
-        float(KINDS.index(description["kind"])),
+        float(KINDS.index(kind)),
         0.5,
         data_type="FLOAT",
         operation="NOT_EQUAL",
@@ -234,7 +256,9 @@ def main(arguments: list[str]) -> int:
     """Run the command line; returns the exit code."""
     spec, frames, path = arguments
     try:
-        SceneFile(Path(spec), threads=1, gpu=None).save(json.loads(frames), Path(path))
+        scene = SceneFile(Path(spec), threads=1, gpu=None)
+        save = scene.save_alembic if path.endswith(".abc") else scene.save_blend
+        save(json.loads(frames), Path(path))
     except (RenderInputError, RuntimeError, OSError, ValueError) as error:
         sys.stdout.write(f"SCENE_FAILED {str(error).replace(chr(10), ' ')}\n")
         return 1

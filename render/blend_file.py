@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from render.errors import InvalidFileError
 from render.suffixed import read_as, written_as
 
 _TIMEOUT_S = 120.0
+_OGAWA = struct.Struct("<5sBHQ")  # name, 255 once it is closed, version, where the root group is
 _SCENE_S, _SCENE_S_PER_FRAME = 300.0, 5.0  # lamps of fires take a look at each frame's volume
 
 
@@ -41,14 +43,14 @@ def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str]
     return [str(name) for name in json.loads(_ask(path, blender, tried, "MATERIALS"))]
 
 
-def write_scene_file(path: Path, spec: Path, frames: Sequence[int], blender: str | None) -> None:
-    """Write the scene of a RenderSpec document as a .blend file that plays these frames.
+def write_scene_file(path: Path, spec: Path, frames: Sequence[int], blender: str | None, *, suffix: str) -> None:
+    """Write the scene of a RenderSpec document, of these frames: .blend with all of it, or .abc with its meshes.
 
     Raises:
         BlenderUnavailableError: Blender does not answer.
         InvalidFileError: a file of a frame is missing or unfit.
     """
-    with written_as(path, ".blend") as named:
+    with written_as(path, suffix) as named:
         argv = script_argv(blender, "scene_file.py", [str(spec.resolve()), json.dumps(list(frames)), str(named)])
         purpose = "write the scene"
         completed = run_script(argv, timeout_s=_SCENE_S + _SCENE_S_PER_FRAME * len(frames), purpose=purpose)
@@ -65,6 +67,22 @@ def validate_scene_file(path: Path, blender: str | None) -> None:
     with read_as(path, ".blend") as named:
         if not read_material_names(named, blender):
             raise InvalidFileError(path, "has no material, as any scene has")
+
+
+def validate_alembic(path: Path) -> None:
+    """Look whether an Alembic file of the Ogawa kind was closed, and begins where it says.
+
+    Raises:
+        InvalidFileError: it is damaged.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(_OGAWA.size)
+    if len(head) < _OGAWA.size or not head.startswith(b"Ogawa"):
+        raise InvalidFileError(path, "is not an Alembic file")
+    _, closed, _, root = _OGAWA.unpack(head)
+    if closed != 0xFF or root >= path.stat().st_size:
+        raise InvalidFileError(path, "was truncated")
 
 
 def _ask(path: Path, blender: str | None, tried: Sequence[str], wanted: str) -> str:

@@ -26,7 +26,7 @@ from pipeline.queue.submitting import QueueOptions
 if TYPE_CHECKING:
     from pipeline.stages.export import ExportStage
 
-FORMATS = ("vtk", "usd", "blend")
+FORMATS = ("usd", "blend", "abc", "vtk")
 """As the stages have them, which are too heavy to be imported for `--help`."""
 OPENJD = "openjd"
 
@@ -67,12 +67,15 @@ def export(
     folder, and shows the files beside it by relative paths; -o makes a copy that can be given away.
 
     \b
+    usd     Houdini, Maya, Omniverse and others: meshes, points, volumes, camera, preview materials
+    blend   Blender 4.5 LTS and later: the whole lit scene, which renders the film's frames
+    abc     Alembic, one file: bodies, surfaces, cloths, whitewater and camera; no smoke, no materials
     vtk     ParaView: one time series of particles, surfaces, cloths, bodies and smoke, with names and units
     openjd  a farm manager: an Open Job Description template of the whole job, which runs it there
 
     \b
-    pipeline export my-film --to vtk
-    pipeline export my-film --to vtk --frames 10-40 -o ~/for-paraview
+    pipeline export my-film --to usd
+    pipeline export my-film --to blend --frames 10-40 -o ~/for-anna
     pipeline export dam.toml --to vtk --set fluid.water.particle_radius=0.01
     pipeline export dam.toml --to openjd --output /shared/renders
     """

@@ -23,7 +23,7 @@ def job_template(name: str, tasks: Sequence[Task], *, python: str) -> dict[str, 
         "specificationVersion": SPECIFICATION,
         "extensions": ["TASK_CHUNKING"],
         "name": name[:_NAME_CHARACTERS],
-        "description": "A film of simulated physics, made by `pipeline export openjd`.",
+        "description": "A film of simulated physics, made by `pipeline export --to openjd`.",
         "parameterDefinitions": [
             {
                 "name": "JobFolder",

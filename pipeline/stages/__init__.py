@@ -8,7 +8,7 @@ from pipeline.stages.base import Stage
 from pipeline.stages.bodies import BodiesStage
 from pipeline.stages.bounds import BoundsStage
 from pipeline.stages.export import ExportStage
-from pipeline.stages.export_blend import BlendExport
+from pipeline.stages.export_blend import AbcExport, BlendExport
 from pipeline.stages.export_usd import UsdExport
 from pipeline.stages.export_vtk import VtkExport
 from pipeline.stages.movie import MovieStage
@@ -17,7 +17,9 @@ from pipeline.stages.render import RenderStage
 from pipeline.stages.simulate import SimulateStage
 from pipeline.stages.whitewater import WhitewaterStage
 
-EXPORTS: dict[str, ExportStage] = {stage.format: stage for stage in (VtkExport(), UsdExport(), BlendExport())}
+EXPORTS: dict[str, ExportStage] = {
+    stage.format: stage for stage in (VtkExport(), UsdExport(), BlendExport(), AbcExport())
+}
 """What a job can be exported to, by the name of the format."""
 
 

@@ -26,6 +26,7 @@ class ExportStage(Stage):
         about: what it is, for people.
         opened_by: how to open it, a sentence with {file}.
         frames: those that are chosen; None: all.
+        of_one_range: whether its frames have to follow each other.
         refers_to: folders of the job whose files the export shows by relative paths instead of copying them.
     """
 
@@ -34,6 +35,7 @@ class ExportStage(Stage):
     about: str
     opened_by: str
     frames: frozenset[int] | None = None
+    of_one_range: bool = False
     refers_to: tuple[str, ...] = ()
 
     @property
@@ -56,6 +58,8 @@ class ExportStage(Stage):
         frames = range(job.frame_count) if self.frames is None else sorted(self.frames)
         if frames and frames[-1] >= job.frame_count:
             raise PlanError(f"{job.name} has no frame {frames[-1]}; its frames are 0-{job.frame_count - 1}")
+        if self.of_one_range and len(frames) != frames[-1] - frames[0] + 1:
+            raise PlanError(f"{self.format} plays every frame from its first to its last; name one range, like 10-40")
         return list(frames)
 
     def belonging(self, tasks: list[Task]) -> list[ArtifactPath]:

@@ -1,4 +1,4 @@
-"""Export as a .blend file: the lit scene as the film has it, for artists who go on in Blender."""
+"""Exports by Blender: the lit scene as the film has it, and its moving meshes as Alembic."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
+from pipeline.base.errors import PlanError
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
@@ -18,15 +19,62 @@ from pipeline.stages.inputs import blender_version
 from pipeline.stages.render import CORES, WORKER_BYTES, RenderStage, decisive
 from pipeline.stages.render_drawing import FrameDrawing
 from pipeline.stages.render_scene import framed_points, render_spec, write_motion
-from render.blend_file import validate_scene_file, write_scene_file
+from render.blend_file import validate_alembic, validate_scene_file, write_scene_file
 from render.meshes import validate_ply
-from render.spec import MeshSequenceObject, SceneObject
+from render.spec import MeshSequenceObject, RenderSpec, SceneObject, VolumeSequenceObject
 from render.temporary_folder import temporary_folder
 
 FOLDER = "blend"
 
 
-class BlendExport(ExportStage):
+class _SceneExport(ExportStage):
+    """One file of all frames, written by Blender."""
+
+    of_one_range = True
+
+    def preflight(self, job: Job) -> list[str]:
+        """What drawing needs, too."""
+        return RenderStage().preflight(job)
+
+    def _spec(self, job: Job, layout: JobLayout) -> RenderSpec:
+        return render_spec(job, layout, framed_points(job, layout))
+
+    def _scene_task(self, job: Job, layout: JobLayout, read: Iterable[ArtifactPath]) -> Task:
+        """The task that writes the file; beside meshes at rest and poses it reads these."""
+        frames = self.chosen(job)
+        cached = [layout.frame_cache(frame) for frame in frames] if job.moving_bodies else []
+        meshes = [mesh for _, _, mesh in meshes_of(job)]
+        return Task(
+            id=TaskId(f"{self.name}/scene"),
+            stage=self.name,
+            inputs=(*read, *cached, *meshes, *_film_bounds(job, layout)),
+            outputs=(self.root(job),),
+            parameters=ParameterSet.of(
+                stage=self.name,
+                version=self.version,
+                tools={"blender": blender_version(job.render.blender)},
+                spec=decisive(render_spec(job, layout)),
+                camera=job.placed_camera.model_dump(mode="json"),
+                frames=frames,
+            ),
+            resources=Resources(memory_bytes=WORKER_BYTES),
+        )
+
+    def _write_scene(self, context: TaskContext) -> None:
+        job, layout, task = context.job, context.layout, context.task
+        frames: list[int] = json.loads(task.parameters.canonical)["frames"]
+        for done, frame in enumerate(frames):
+            write_motion(job, layout, frame, attempt=context.attempt)
+            context.progress(done, len(frames) + 1, "camera and bodies")
+        document = layout.root / "scene.json"
+        document.write_text(self._spec(job, layout).document(), encoding="utf-8")
+        blender = job.render.blender
+        validate = validate_alembic if self.format == "abc" else partial(validate_scene_file, blender=blender)
+        with context.committing(task.outputs[0], validate) as path:
+            write_scene_file(path, document, frames, blender, suffix=f".{self.format}")
+
+
+class BlendExport(_SceneExport):
     """The scene, and of each frame the fluids as they are drawn; all else it plays are the job's own files."""
 
     format = "blend"
@@ -37,14 +85,16 @@ class BlendExport(ExportStage):
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame with fluids that touch something, and one for the scene."""
-        tools = {"blender": blender_version(job.render.blender)}
         spec = render_spec(job, layout)
-        fluids = [each.name for each in _wet(spec.objects)]
-        meshes = [mesh for _, _, mesh in meshes_of(job)]
+        fluids = _wet(spec.objects)
         frames = self.chosen(job)
-        of_objects = decisive(spec)["objects"]
+        meshes = [mesh for _, _, mesh in meshes_of(job)]
         parameters = ParameterSet.of(
-            stage=self.name, version=self.version, tools=tools, objects=of_objects, floor=spec.domain_min[2]
+            stage=self.name,
+            version=self.version,
+            tools={"blender": blender_version(job.render.blender)},
+            objects=decisive(spec)["objects"],
+            floor=spec.domain_min[2],
         )
         tasks = [
             Task(
@@ -52,11 +102,11 @@ class BlendExport(ExportStage):
                 stage=self.name,
                 inputs=(
                     *meshes,
-                    *(path for _, _, path in products_of(job, layout, frame) if not path.startswith("volumes/")),
+                    *_played(job, layout, frame, volumes=False),
                     *([layout.frame_cache(frame)] if job.moving_bodies else ()),
-                    *([layout.film_bounds()] if job.camera.frames_action else ()),
+                    *_film_bounds(job, layout),
                 ),
-                outputs=tuple(_wet_file(name, frame) for name in fluids),
+                outputs=tuple(JobLayout.product(FOLDER, name, frame, ".ply") for name in fluids),
                 parameters=parameters,
                 frame=frame,
                 resources=Resources(cores=CORES, memory_bytes=WORKER_BYTES),
@@ -64,64 +114,59 @@ class BlendExport(ExportStage):
             for frame in (frames if fluids else ())
         ]
         drawn_otherwise = {layout.surface(name, frame) for name in fluids for frame in frames}
-        played = [path for frame in frames for _, _, path in products_of(job, layout, frame)]
-        points = [layout.whitewater(fluid, frame) for fluid in job.whitewater for frame in frames]
-        cached = [layout.frame_cache(frame) for frame in frames] if job.moving_bodies else []
-        scene = Task(
-            id=TaskId(f"{self.name}/scene"),
-            stage=self.name,
-            inputs=(
-                *(output for task in tasks for output in task.outputs),
-                *(path for path in played if path not in drawn_otherwise),
-                *points,
-                *cached,
-                *meshes,
-                *([layout.film_bounds()] if job.camera.frames_action else ()),
-            ),
-            outputs=(self.root(job),),
-            parameters=ParameterSet.of(
-                stage=self.name,
-                version=self.version,
-                tools=tools,
-                spec=decisive(spec),
-                camera=job.placed_camera.model_dump(mode="json"),
-                frames=frames,
-            ),
-            resources=Resources(memory_bytes=WORKER_BYTES),
-        )
-        return [*tasks, scene]
-
-    def preflight(self, job: Job) -> list[str]:
-        """What drawing needs, too."""
-        return RenderStage().preflight(job)
+        played = [path for frame in frames for path in _played(job, layout, frame, volumes=True)]
+        wet = [output for task in tasks for output in task.outputs]
+        return [
+            *tasks,
+            self._scene_task(job, layout, [*wet, *(each for each in played if each not in drawn_otherwise)]),
+        ]
 
     def run(self, context: TaskContext) -> None:
         """Write the fluids of a frame, or the scene."""
-        job, layout, task = context.job, context.layout, context.task
-        if task.frame is not None:
-            _, view = write_motion(job, layout, task.frame, attempt=context.attempt)
+        task = context.task
+        if task.frame is None:
+            self._write_scene(context)
+        else:
+            _, view = write_motion(context.job, context.layout, task.frame, attempt=context.attempt)
             with temporary_folder("surfaces") as folder:
                 FrameDrawing(context, view, []).renderer.save_surfaces(task.frame, folder)
                 for output in task.outputs:
                     with context.committing(output, validate_ply) as path:
                         path.write_bytes((folder / f"{Path(output).parent.name}.ply").read_bytes())
-        else:
-            frames: list[int] = json.loads(task.parameters.canonical)["frames"]
-            for done, frame in enumerate(frames):
-                write_motion(job, layout, frame, attempt=context.attempt)
-                context.progress(done, len(frames) + 1, "camera and bodies")
-            document = layout.root / "scene.json"
-            document.write_text(render_spec(job, layout, framed_points(job, layout)).document(), encoding="utf-8")
-            blender = job.render.blender
-            with context.committing(task.outputs[0], partial(validate_scene_file, blender=blender)) as path:
-                write_scene_file(path, document, frames, blender)
         context.progress(1, 1)
 
 
-def _wet(objects: Iterable[SceneObject]) -> list[MeshSequenceObject]:
-    """Fluids that tell where they touch something."""
-    return [each for each in objects if isinstance(each, MeshSequenceObject) and each.wets_within is not None]
+class AbcExport(_SceneExport):
+    """Alembic: bodies, surfaces, cloths, whitewater as loose points, the camera. It has no volumes."""
+
+    format = "abc"
+    version = 1
+    about = "one Alembic file of bodies, surfaces, cloths, whitewater and camera; no smoke, no materials"
+    opened_by = "import {file} in any program of Alembic; metres, y up, 1 sample a frame"
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task."""
+        if all(isinstance(each, VolumeSequenceObject) for each in render_spec(job, layout).objects):
+            raise PlanError(f"{job.name} has only smoke, and Alembic has no volumes; use --to usd or --to blend")
+        read = [path for frame in self.chosen(job) for path in _played(job, layout, frame, volumes=True)]
+        return [self._scene_task(job, layout, read)]
+
+    def run(self, context: TaskContext) -> None:
+        """Write the file."""
+        self._write_scene(context)
+        context.progress(1, 1)
 
 
-def _wet_file(fluid: str, frame: int) -> ArtifactPath:
-    return JobLayout.product(FOLDER, fluid, frame, ".ply")
+def _played(job: Job, layout: JobLayout, frame: int, *, volumes: bool) -> list[ArtifactPath]:
+    """Files of a frame that the scene plays."""
+    products = [path for _, _, path in products_of(job, layout, frame) if volumes or not path.endswith(".vdb")]
+    return [*products, *(layout.whitewater(fluid, frame) for fluid in job.whitewater)]
+
+
+def _film_bounds(job: Job, layout: JobLayout) -> list[ArtifactPath]:
+    return [layout.film_bounds()] if job.camera.frames_action else []
+
+
+def _wet(objects: Iterable[SceneObject]) -> list[str]:
+    """Names of the fluids that tell where they touch something."""
+    return [each.name for each in objects if isinstance(each, MeshSequenceObject) and each.wets_within is not None]

@@ -66,7 +66,7 @@ class Way:
 
     def __init__(self, cluster: SlurmCluster, film: Studio) -> None:
         self.cluster, self.film = cluster, film
-        film.run("export", "openjd", "tiny.toml", *CPU).assert_code(0)
+        film.run("export", "tiny.toml", "--to", "openjd", *CPU).assert_code(0)
 
     def begin(self) -> None:
         """Submit the jobs; also again, after one was ended."""

@@ -29,7 +29,7 @@ WRITERS = {
     "rerun": [["{job}", "--failed"], ["{job}", "--stage", "render"]],
     "resume": [["{job}"]],
     "work": [["{job}", "--stage", "simulate"], ["{job}", "--stage", "render"]],
-    "export": [["openjd", "{file}", "--output", "{farm}", "--set", "device=cpu", "--set", "render.device=cpu"]],
+    "export": [["{file}", "--to", "openjd", "--output", "{farm}", "--set", "device=cpu", "--set", "render.device=cpu"]],
     "still": [["{job}", "--frame", "0"], ["{job}", "--sheet"]],
     "animatic": [["{job}"]],
     "compare": [["{job}", "{job}", "--to", "{farm}/pair.mp4"]],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -240,6 +241,41 @@ def test_the_blend_file_given_away_draws_the_films_frame(blend, tmp_path):
     film, drawn = (read_picture(path)[..., :3].astype(float) / 255.0 for path in (own, picture))
     # Measured 0.0003: normals of imported surfaces are rounded. Without the whitewater it is 0.01.
     assert np.abs(film - drawn).mean() < 0.002
+
+
+def test_alembic_has_what_the_cache_has(studio, tmp_path):
+    """Blender's reader is the only one of Alembic that has a package; positions are y up in the file."""
+    studio.run("export", "tiny", "--to", "abc").assert_code(0)
+    script = """
+import json, sys, bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.context.scene.render.fps = 60
+bpy.ops.wm.alembic_import(filepath=sys.argv[1], set_frame_range=True, as_background_job=False)
+scene = bpy.context.scene
+scene.frame_set(int(sys.argv[2]))
+graph, told = bpy.context.evaluated_depsgraph_get(), {"": [scene.frame_start, scene.frame_end]}
+for each in bpy.data.objects:
+    if each.type == "MESH":
+        made = each.evaluated_get(graph)
+        velocity = made.data.attributes.get("velocity")
+        told[each.name] = [
+            [list(made.matrix_world @ vertex.co) for vertex in made.data.vertices],
+            [list(row.vector) for row in velocity.data] if velocity else None,
+        ]
+print("TOLD", json.dumps(told))
+"""
+    argv = [sys.executable, "-c", script, str(studio.layout.root / "tiny.abc"), str(LAST)]
+    printed = subprocess.run(argv, check=True, capture_output=True, text=True, cwd=PROJECT).stdout
+    told = json.loads(next(line for line in printed.splitlines() if line.startswith("TOLD "))[5:])
+    assert told[""] == [0, LAST]
+    mesh, cloth, cloud = surface(studio, LAST), cached(studio, "sheet", LAST).arrays, whitewater(studio, LAST)
+    np.testing.assert_allclose(told["water"][0], mesh.vertices, atol=1e-6)
+    np.testing.assert_allclose(told["water"][1], mesh.velocities, atol=1e-5)
+    np.testing.assert_allclose(told["sheet"][0], cloth["position"], atol=1e-6)
+    np.testing.assert_allclose(told["sheet"][1], cloth["velocity"], atol=1e-5)
+    pose = cached(studio, "ball", LAST).arrays
+    np.testing.assert_allclose(np.mean(told["ball"][0], axis=0), pose["position"], atol=1e-4)
+    assert len(told["water_foam"][0]) == (cloud.kind == KINDS.index("foam")).sum()
 
 
 # --- exports as stages ---
