@@ -46,8 +46,8 @@ until_option = click.option(
     "--until",
     multiple=True,
     metavar="STAGE",
-    help="End after this stage: simulate, surface, cloth, volume, whitewater, render, ..., or frames of it, as render:0-9; "
-    "may be given several times.",
+    help="End after this stage: simulate, surface, cloth, volume, whitewater, render, ...; or after frames of it, as "
+    "render:0-9. May be given several times.",
 )
 
 

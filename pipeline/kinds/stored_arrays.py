@@ -16,6 +16,21 @@ SMALL_BYTES = 1 << 20
 MOST_COMPRESSED = 1100
 """Deflate makes nothing smaller than a thousandth and a bit; what claims more was never written."""
 
+_UNITS = {
+    "position": "m",
+    "velocity": "m/s",
+    "angular_velocity": "rad/s",
+    "pressure": "Pa",
+    "temperature": "K",
+    "uv": "m",
+}
+_UNITS_BY_KIND = {("fluid", "density"): "kg/m3"}
+
+
+def unit_of(kind: str, key: str) -> str:
+    """Unit of an array of a body of this kind, as other programs read it; "1" of numbers without one."""
+    return _UNITS_BY_KIND.get((kind, key)) or _UNITS.get(key, "1")
+
 
 def write_array(group: h5py.Group, key: str, array: NDArray[np.generic]) -> None:
     """Store an array as it is, compressed where that gains anything."""

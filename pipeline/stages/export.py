@@ -23,7 +23,6 @@ class ExportStage(Stage):
 
     Attributes:
         format: its name, as `pipeline export --to` takes it.
-        about: what it is, for people.
         opened_by: how to open it, a sentence with {file}.
         frames: those that are chosen; None: all.
         of_one_range: whether its frames have to follow each other.
@@ -32,7 +31,6 @@ class ExportStage(Stage):
 
     on_demand = True
     format: str
-    about: str
     opened_by: str
     frames: frozenset[int] | None = None
     of_one_range: bool = False

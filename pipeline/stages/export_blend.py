@@ -79,7 +79,6 @@ class BlendExport(_SceneExport):
 
     format = "blend"
     version = 1
-    about = "the whole lit scene for Blender 4.5 LTS and later, which renders the film's frames"
     opened_by = "open {file} in Blender 4.5 LTS or later; it plays the files beside it"
     refers_to = ("surfaces", "cloths", "whitewater", "volumes")
 
@@ -141,7 +140,6 @@ class AbcExport(_SceneExport):
 
     format = "abc"
     version = 1
-    about = "one Alembic file of bodies, surfaces, cloths, whitewater and camera; no smoke, no materials"
     opened_by = "import {file} in any program of Alembic; metres, y up, 1 sample a frame"
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

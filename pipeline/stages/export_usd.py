@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
@@ -30,12 +28,7 @@ class UsdExport(ExportStage):
 
     format = "usd"
     version = 1
-    about = (
-        "a scene for Houdini, Maya, Omniverse, Blender: surfaces, cloths, bodies, points, volumes, camera, materials"
-    )
-    opened_by = (
-        "open {file} in any program of USD (usdview {file}; Blender: File > Import > Universal Scene Description)"
-    )
+    opened_by = "open {file} in any program of USD: Houdini, Maya, usdview, in Blender File > Import > USD"
     refers_to = ("volumes",)
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
@@ -105,11 +98,11 @@ def _changing(spec: RenderSpec) -> list[MeshSequenceObject | PointSequenceObject
     return [each for each in spec.objects if isinstance(each, MeshSequenceObject | PointSequenceObject)]
 
 
-def _particles(job: Job) -> Iterator[tuple[Kind, str, str]]:
+def _particles(job: Job) -> list[tuple[Kind, str, str]]:
     """Bodies of points: their kind and name, and what their particles are called."""
-    for _, kind, body in bodies(job):
-        if kind.display.form == "points":
-            yield kind, body.name, f"{body.name}.particles"
+    return [
+        (kind, body.name, f"{body.name}.particles") for _, kind, body in bodies(job) if kind.display.form == "points"
+    ]
 
 
 def _write_frame(context: TaskContext, frame: int) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.kinds.stored_arrays import unit_of
 from pipeline.kinds.table import bodies
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
@@ -23,15 +24,6 @@ from render.vtk_files import Values, validate_vtk, write_blocks, write_grid, wri
 from sim.core.motion.rotation import rotated
 
 FOLDER = "vtk"
-UNITS = {
-    "velocity": "m/s",
-    "density": "kg/m3",
-    "pressure": "Pa",
-    "particle_id": "1",
-    "uv": "m",
-    "normals": "1",
-    "temperature": "K",
-}
 
 
 class VtkExport(ExportStage):
@@ -39,7 +31,6 @@ class VtkExport(ExportStage):
 
     format = "vtk"
     version = 1
-    about = "one time series for ParaView: particles, surfaces, cloths, bodies and smoke, with names and units"
     opened_by = "open {file} in ParaView (paraview {file})"
 
     def root(self, job: Job) -> ArtifactPath:
@@ -137,14 +128,15 @@ class _Frame:
         snapshot = read_compact(self._cache, body.name)
         arrays = dict(snapshot.arrays)
         position = arrays.pop("position")
-        values = {key: Values(array, UNITS.get(key, "1")) for key, array in arrays.items()}
+        values = {key: Values(array, unit_of(snapshot.kind, key)) for key, array in arrays.items()}
         radius = np.full(len(position), snapshot.number("particle_radius"), np.float32)
         write_polydata(path, position, point_values={**values, "radius": Values(radius, "m")}, time_s=self._time_s)
 
     def _mesh(self, path: Path, *, body: Any) -> None:
-        arrays = dict(read_compact(self._cache, body.name).arrays)
+        snapshot = read_compact(self._cache, body.name)
+        arrays = dict(snapshot.arrays)
         position, triangles = arrays.pop("position"), arrays.pop("triangles")
-        values = {key: Values(array, UNITS.get(key, "1")) for key, array in arrays.items()}
+        values = {key: Values(array, unit_of(snapshot.kind, key)) for key, array in arrays.items()}
         write_polydata(path, position, triangles=triangles, point_values=values, time_s=self._time_s)
 
     def _parts(self, path: Path, *, body: Any) -> None:
@@ -165,7 +157,7 @@ class _Frame:
             path,
             position + arms,
             triangles=triangles,
-            point_values={"velocity": Values(speeds, UNITS["velocity"])},
+            point_values={"velocity": Values(speeds, "m/s")},
             cell_values={"part": Values(part, "1")},
             time_s=self._time_s,
         )
@@ -174,8 +166,8 @@ class _Frame:
         smoke = read_compact(self._cache, body.name)
         values = {
             "density": Values(smoke.density, "1"),
-            "temperature": Values(smoke.temperature, UNITS["temperature"]),
-            "velocity": Values(smoke.velocity, UNITS["velocity"]),
+            "temperature": Values(smoke.temperature, "K"),
+            "velocity": Values(smoke.velocity, "m/s"),
         }
         write_grid(
             path,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.kinds.smoke_codec import read_density
-from pipeline.kinds.stored_arrays import read_array, write_array
+from pipeline.kinds.stored_arrays import read_array, unit_of, write_array
 from sim.core.snapshots import Attribute, Snapshot
 from sim.core.solver import Diagnostics
 from sim.core.world import FrameReport
@@ -94,9 +94,11 @@ def write_frame(
             codec = _codec_of(snapshot.kind)
             if codec is not None and longest_shutter_s is not None:
                 codec.write(group, name, snapshot, longest_shutter_s=longest_shutter_s)
-                continue
-            for key, array in snapshot.arrays.items():
-                write_array(group, key, array)
+            else:
+                for key, array in snapshot.arrays.items():
+                    write_array(group, key, array)
+            for key in snapshot.arrays:
+                group[key].attrs["units"] = unit_of(snapshot.kind, key)
         for name, diagnostics in report.diagnostics.items():
             group = file.create_group(f"diagnostics/{name}")
             group.attrs["substeps"] = report.substeps.get(name, 0)

@@ -12,13 +12,14 @@ from farm_processes import Farm, wait_until
 
 from pipeline.base.errors import PlanError, StageUnavailableError
 from pipeline.base.layout import JobLayout
+from pipeline.cli.export import FORMATS
 from pipeline.job.loading import job_of_text
 from pipeline.queue.changes import continuation
 from pipeline.queue.job_queue import JobQueue
 from pipeline.record.reader import SUCCEEDED
 from pipeline.run.goal import read_goal, write_goal
 from pipeline.run.plan import plan_job
-from pipeline.stages import STAGES
+from pipeline.stages import EXPORTS, STAGES
 from pipeline.stages.render import RenderStage
 
 SCENE = """
@@ -155,3 +156,19 @@ def test_a_plain_submit_continues_to_the_film_and_the_queue_keeps_the_goal_of_a_
     assert read_goal(farm.layout("a")) == ()
     succeeded = [row.task for row in farm.attempts("a") if row.outcome == SUCCEEDED]
     assert len(succeeded) == len(set(succeeded)) == 62
+
+
+def test_a_stage_may_be_named_with_frames():
+    job = job_of_text(SCENE, Path("job.toml"))
+    tasks = plan_job(job, JobLayout(Path("renders/small")), STAGES, ("surface:1",))
+    assert [task.id for task in tasks] == ["simulate", "surface/water/000001"]
+    with pytest.raises(PlanError, match="nothing for the stage"):
+        plan_job(job, JobLayout(Path("renders/small")), STAGES, ("surface:2",))
+    with pytest.raises(PlanError, match="runs backwards"):
+        plan_job(job, JobLayout(Path("renders/small")), STAGES, ("surface:1-0",))
+
+
+def test_exports_are_planned_only_where_they_are_asked_for():
+    assert stages_until("export-vtk") == ["simulate", "surface", "export-vtk"]
+    assert not [stage for stage in stages_until() if stage.startswith("export")]
+    assert tuple(EXPORTS) == FORMATS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -179,3 +180,19 @@ def test_the_most_compressible_array_is_still_read(tmp_path):
     path = tmp_path / "c.h5"
     write_checkpoint(path, Checkpoint(0, "f", "cpu", {"still": np.zeros(8 << 20)}))
     assert not read_checkpoint(path).arrays["still"].any()
+
+
+def test_every_array_of_a_body_says_its_unit(tmp_path):
+    path = tmp_path / "frame.h5"
+    there = bodies()
+    plume = replace(there["plume"], attributes={**there["plume"].attributes, "ambient_temperature": 293.0})
+    write_frame(path, {**there, "plume": plume}, REPORT, device="cpu", longest_shutter_s=1 / 60)
+    with h5py.File(path) as file:
+        units = {
+            f"{group.attrs['kind']}/{key}": dataset.attrs["units"]
+            for group in file["bodies"].values()
+            for key, dataset in group.items()
+        }
+    assert units["fluid/position"] == "m"
+    assert (units["fluid/density"], units["smoke/density"]) == ("kg/m3", "1")
+    assert set(units.values()) <= {"m", "m/s", "kg/m3", "Pa", "K", "rad/s", "1"}
