@@ -18,7 +18,7 @@ from pipeline.stages.simulate import SimulateStage
 from pipeline.stages.whitewater import WhitewaterStage
 
 EXPORTS: dict[str, ExportStage] = {
-    stage.format: stage for stage in (VtkExport(), UsdExport(), BlendExport(), AbcExport())
+    stage.format: stage for stage in (UsdExport(), BlendExport(), AbcExport(), VtkExport())
 }
 """What a job can be exported to, by the name of the format."""
 
