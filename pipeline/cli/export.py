@@ -17,7 +17,7 @@ from pipeline.cli.arguments import (
     output_option,
     parse_frames,
     queue_options,
-    require_own_programs,
+    read_own_job,
     submission_folder,
 )
 from pipeline.cli.make import submit_until
@@ -110,12 +110,12 @@ def _export(
     options: QueueOptions,
     target: Path | None,
 ) -> None:
-    from pipeline.job.loading import load_job, read_job
+    from pipeline.job.loading import load_job
     from pipeline.queue.job_queue import Desired, JobQueue
     from pipeline.show.handing_over import copy_export, refuse_if_busy, survey_export
     from pipeline.stages import STAGES
 
-    job = read_job(job_file, overrides, preview=preview).job
+    job = read_own_job(job_file, overrides, preview=preview, until=(end,)).job
     layout = submission_folder(job_file, job.name, output, is_changed=bool(overrides) or preview)
     waiting = JobQueue.of(layout).find(layout.root.absolute().name)
     refuse_if_busy(layout, None if waiting is None or waiting.desired is Desired.NONE else waiting.until)
@@ -157,8 +157,8 @@ def _write_openjd(job_file: Path, overrides: tuple[str, ...], *, preview: bool, 
     from pipeline.show.openjd import job_template
     from pipeline.stages import STAGES
 
+    read_own_job(job_file, overrides, preview=preview)
     loaded, _ = load_checked_job(job_file, overrides, preview=preview)
-    require_own_programs(loaded, overrides)
     require_named_devices(loaded.job, [stage.name for stage in STAGES])
     print_warnings(loaded.warnings)
     layout = JobLayout((output / loaded.job.name).absolute())

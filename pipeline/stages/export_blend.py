@@ -79,6 +79,7 @@ class BlendExport(_SceneExport):
 
     format = "blend"
     version = 1
+    about = "the scene for Blender"
     opened_by = "open {file} in Blender 4.5 LTS or later; it plays the files beside it"
     refers_to = ("surfaces", "cloths", "whitewater", "volumes")
 
@@ -140,6 +141,7 @@ class AbcExport(_SceneExport):
 
     format = "abc"
     version = 1
+    about = "moving meshes as Alembic"
     opened_by = "import {file} in any program of Alembic; metres, y up, 1 sample a frame"
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

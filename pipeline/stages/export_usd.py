@@ -28,6 +28,7 @@ class UsdExport(ExportStage):
 
     format = "usd"
     version = 1
+    about = "layers of USD"
     opened_by = "open {file} in any program of USD: Houdini, Maya, usdview, in Blender File > Import > USD"
     refers_to = ("volumes",)
 

@@ -31,6 +31,7 @@ class VtkExport(ExportStage):
 
     format = "vtk"
     version = 1
+    about = "ParaView's files"
     opened_by = "open {file} in ParaView (paraview {file})"
 
     def root(self, job: Job) -> ArtifactPath:
