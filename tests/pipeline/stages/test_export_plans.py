@@ -1,0 +1,72 @@
+"""What exports plan and refuse, without any file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from planned_jobs import LAYOUT
+
+from pipeline.base.errors import PipelineError, PlanError
+from pipeline.base.layout import JobLayout
+from pipeline.job.loading import job_of_text
+from pipeline.run.plan import plan_job
+from pipeline.show.handing_over import refuse_if_busy
+from pipeline.stages import EXPORTS, STAGES
+
+SMOKE = """
+name = "tank"
+frames = 6
+
+[[smoke]]
+name = "plume"
+cell_size = 0.1
+source = [{ shape = { type = "sphere", radius = 0.2 }, position = [0.0, 0.0, 0.3] }]
+"""
+BALL = """
+[[rigid]]
+name = "ball"
+shape = { type = "sphere", radius = 0.1 }
+position = [0.3, 0.0, 0.3]
+"""
+
+
+def exported(text: str, end: str) -> dict[str, object]:
+    tasks = plan_job(job_of_text(text, Path("job.toml")), LAYOUT, STAGES, (end,))
+    return {task.id: task for task in tasks if task.stage.startswith("export-")}
+
+
+def test_alembic_is_refused_for_a_job_of_smoke_alone():
+    with pytest.raises(PlanError, match="no volumes"):
+        exported(SMOKE, "export-abc")
+    assert [*exported(SMOKE + BALL, "export-abc")] == ["export-abc/scene"]
+
+
+@pytest.mark.parametrize("name", ["blend", "abc"])
+def test_what_plays_every_frame_refuses_gaps(name):
+    with pytest.raises(PlanError, match="one range"):
+        exported(SMOKE + BALL, f"export-{name}:0,2")
+    assert f"export-{name}/scene" in exported(SMOKE + BALL, f"export-{name}:2-4")
+
+
+def test_frames_are_those_that_were_chosen():
+    assert [*exported(SMOKE + BALL, "export-usd:1,4")] == ["export-usd/000001", "export-usd/000004", "export-usd/scene"]
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_what_is_given_away_ends_with_the_file_to_open(name):
+    job = job_of_text(SMOKE + BALL, Path("job.toml"))
+    tasks = plan_job(job, LAYOUT, STAGES, (f"export-{name}",))
+    files = EXPORTS[name].belonging(tasks)
+    assert files[-1] == EXPORTS[name].root(job)
+    assert not [each for each in files if each.startswith("cache/")]
+    assert any(each.endswith(".vdb") for each in files) == (name in ("usd", "blend"))
+
+
+def test_an_export_does_not_take_the_place_of_a_film_that_waits(tmp_path):
+    layout = JobLayout(tmp_path)
+    refuse_if_busy(layout, None)
+    refuse_if_busy(layout, ("export-usd:0-9",))
+    for waiting in ((), ("surface",), ("export-usd", "render")):
+        with pytest.raises(PipelineError, match="waits in the queue"):
+            refuse_if_busy(layout, waiting)
