@@ -17,11 +17,10 @@ from pipeline.cli.arguments import (
     output_option,
     parse_frames,
     queue_options,
-    read_own_job,
     submission_folder,
 )
-from pipeline.cli.make import submit_until
 from pipeline.queue.submitting import QueueOptions
+from pipeline.queue.submitting import submit as submit_to_queue
 
 if TYPE_CHECKING:
     from pipeline.stages.export import ExportStage
@@ -112,14 +111,15 @@ def _export(
 ) -> None:
     from pipeline.job.loading import load_job
     from pipeline.queue.job_queue import Desired, JobQueue
+    from pipeline.run.checked_job import read_own_job
     from pipeline.show.handing_over import copy_export, refuse_if_busy, survey_export
     from pipeline.stages import STAGES
 
-    job = read_own_job(job_file, overrides, preview=preview, until=(end,)).job
-    layout = submission_folder(job_file, job.name, output, is_changed=bool(overrides) or preview)
+    loaded = read_own_job(job_file, overrides, preview=preview, until=(end,))
+    layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     waiting = JobQueue.of(layout).find(layout.root.absolute().name)
     refuse_if_busy(layout, None if waiting is None or waiting.desired is Desired.NONE else waiting.until)
-    code = submit_until(job_file, overrides, preview=preview, until=(end,), output=output, options=options)
+    code = submit_to_queue(loaded, layout, options=options, until=(end,))
     if code or options.detach:
         if target is not None and not code:
             click.echo("what runs in the background is not copied; call again with -o when it is done", err=True)
@@ -151,14 +151,13 @@ def _write_openjd(job_file: Path, overrides: tuple[str, ...], *, preview: bool, 
     from pipeline.base.lease import refuse_if_held
     from pipeline.base.places import check_places
     from pipeline.job.inputs import keep_inputs
-    from pipeline.run.checked_job import load_checked_job
+    from pipeline.run.checked_job import checked, read_own_job
     from pipeline.run.executors.choice import require_named_devices
     from pipeline.run.plan import plan_job
     from pipeline.show.openjd import job_template
     from pipeline.stages import STAGES
 
-    read_own_job(job_file, overrides, preview=preview)
-    loaded, _ = load_checked_job(job_file, overrides, preview=preview)
+    loaded, _ = checked(read_own_job(job_file, overrides, preview=preview))
     require_named_devices(loaded.job, [stage.name for stage in STAGES])
     print_warnings(loaded.warnings)
     layout = JobLayout((output / loaded.job.name).absolute())
