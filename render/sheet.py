@@ -22,14 +22,16 @@ def contact_sheet(
     *,
     columns: int = 6,
     width: int = 1440,
+    labels: Sequence[str] | None = None,
 ) -> None:
-    """Draw pictures side by side, each with its frame number in the lower left corner.
+    """Draw pictures side by side, each with its frame number in the lower left corner, or with a label.
 
     Args:
         pictures: PNG files, row by row; each is fitted into a cell of the first one's proportions.
         output: the picture to write; its suffix names the format.
         columns: how many in a row; fewer when there are fewer pictures.
         width: of the sheet [pixels], at most: pictures are never enlarged.
+        labels: one for each picture, of several lines where it has some; frame numbers if omitted.
 
     Raises:
         InvalidFileError: a picture is damaged.
@@ -49,22 +51,18 @@ def contact_sheet(
     rows = math.ceil(len(pictures) / columns)
     sheet = Image.new("RGB", (width, rows * (cell_height + _GAP) + _GAP), _BACKGROUND)
     draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(size=max(9, min(18, cell_height // 9)))
+    font_size = max(9, min(18, cell_height // 9))
+    font = ImageFont.load_default(size=font_size)
     for index, path in enumerate(pictures):
         row, column = divmod(index, columns)
         x, y = _GAP + column * (cell_width + _GAP), _GAP + row * (cell_height + _GAP)
         thumbnail = Image.fromarray(read_rgb8(path))
         thumbnail.thumbnail((cell_width, cell_height), Image.Resampling.LANCZOS)
         sheet.paste(thumbnail, (x, y))
-        draw.text(
-            (x + _GAP, y + cell_height - _GAP),
-            frame_label(path),
-            _INK,
-            font,
-            anchor="ls",
-            stroke_width=1,
-            stroke_fill=_SHADE,
-        )
+        label = frame_label(path) if labels is None else labels[index]
+        for line, text in enumerate(reversed(label.split("\n"))):
+            place = (x + _GAP, y + cell_height - _GAP - line * round(1.2 * font_size))
+            draw.text(place, text, _INK, font, anchor="ls", stroke_width=1, stroke_fill=_SHADE)
     sheet.save(output)
 
 

@@ -47,6 +47,7 @@ class JobLayout:
     # --- files of the job itself ---
     job_file = _Below("job.toml")  # as submitted, overrides applied
     goal = _Below("goal.json")  # the stages after which the job ends; not there if it ends with the film
+    siblings = _Below("siblings.json")  # of a job of a sweep: the others, which may have made the same
     recording_story = _Below("take.json")  # of a recording of `pipeline live`; its end adds the number of frames
     manifest = _Below("manifest.db")  # the record of every task
     lease = _Below("runner.lease")  # lock file with the process that runs this job

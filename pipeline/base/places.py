@@ -28,7 +28,15 @@ def check_places(layout: JobLayout, artifacts: Iterable[ArtifactPath] = ()) -> N
 
     Raises PipelineError: something else is in the place of one; says what, and how to heal it.
     """
-    files = [layout.job_file, layout.goal, layout.recording_story, layout.manifest, layout.lease, layout.report]
+    files = [
+        layout.job_file,
+        layout.goal,
+        layout.siblings,
+        layout.recording_story,
+        layout.manifest,
+        layout.lease,
+        layout.report,
+    ]
     folders = [layout.receipts, layout.job_text("").parent, layout.parameters_text("").parent, layout.logs_folder]
     folders += [layout.preview_scratch, layout.stills, layout.inputs, layout.checkpoints]
     folders += [layout.rejected_picture(0).parent]

@@ -22,6 +22,15 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
 
 
+def rough_duration(seconds: float) -> str:
+    """A time span that is an estimate, to a figure or two: `40 s`, `9 min`, `4 h`, `12 days`."""
+    for unit, length, least in (("days", 86400.0, 2.0), ("h", 3600.0, 1.8), ("min", 60.0, 1.5)):
+        if seconds >= least * length:
+            number = seconds / length
+            return f"{number:.1f} {unit}" if number < 3.0 and unit != "min" else f"{number:,.0f} {unit}"
+    return f"{max(5, 5 * round(seconds / 5)):.0f} s" if seconds >= 10.0 else f"{max(1.0, seconds):.0f} s"
+
+
 def size(byte_count: float) -> str:
     """A file size: `512 bytes`, `3.4 KiB`, `1.9 GiB`."""
     if byte_count < 1024:

@@ -16,10 +16,11 @@ from pipeline.cli.look import explain, status
 from pipeline.cli.make import check, new, plan, rerun, submit
 from pipeline.cli.pages import dashboard, live, view
 from pipeline.cli.pictures import animatic, compare, loop, report, still
+from pipeline.cli.sweep import sweep
 from pipeline.run.executors.failures import is_disk_full
 
 SECTIONS = {
-    "Make a film": (new, check, plan, submit, rerun, export),
+    "Make a film": (new, check, plan, submit, sweep, rerun, export),
     "Look at it": (status, explain, view, live, still, animatic, compare, loop, report, dashboard),
     "Control jobs that run or wait": (pause, resume, cancel, priority, work),
     "Keep things in order": (verify, clean, doctor, schema),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pipeline.base import wording
-from pipeline.base.errors import PipelineError
+from pipeline.base.errors import PipelineError, StageUnavailableError
 from pipeline.base.layout import JobLayout
 from pipeline.base.wording import print_warnings
 from pipeline.cli.arguments import (
@@ -25,7 +25,7 @@ from pipeline.cli.arguments import (
     submitted_job_argument,
     until_option,
 )
-from pipeline.queue.submitting import QueueOptions, run
+from pipeline.queue.submitting import QueueOptions, run, say_aside
 from pipeline.queue.submitting import submit as submit_to_queue
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def new(name: Path, template: str) -> None:
 @until_option
 @click.option("--json", "as_json", is_flag=True, help="Print the whole job, defaults included, as JSON.")
 def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tuple[str, ...], as_json: bool) -> None:
-    """Say what is wrong with a job file, and how large the job is.
+    """Say what is wrong with a job file, how large the job is, and what it will take.
 
     \b
     pipeline check my-film
@@ -64,6 +64,9 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
     """
     from pipeline.kinds.table import KINDS
     from pipeline.model.problems import format_path
+    from pipeline.queue.cost import describe, too_long
+    from pipeline.queue.disk import size_of
+    from pipeline.queue.submitting import first_cost
     from pipeline.run.checked_job import checked, needs_pictures, read_own_job
 
     loaded, findings = checked(read_own_job(job_file, overrides, preview=preview, until=until), until)
@@ -82,6 +85,13 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
     if needs_pictures(until):
         width, height = job.render.resolution
         click.echo(f"  {width} x {height} pixels, {job.render.quality} quality")
+    try:
+        expected, without_gpu = first_cost(job, size_of(job, findings), until)
+    except StageUnavailableError as error:  # what cannot be planned here
+        click.echo(f"  what it takes cannot be told here: {error}")
+        return
+    click.echo(f"  {describe(expected, without_gpu)}")
+    print_warnings([warning for warning in (too_long(expected, job),) if warning])
 
 
 @click.command()
@@ -101,21 +111,28 @@ def plan(
     pipeline plan my-film --until surface
     pipeline plan dam.toml --set 'camera.position=[0, -3, 1]'
     """
+    from pipeline.queue.cost import both_ways, costs_here, describe, too_long
+    from pipeline.queue.disk import size_of
     from pipeline.run.assessment import assess_job
-    from pipeline.run.checked_job import checked, read_own_job
-    from pipeline.run.plan import Verdict, estimate, summarize
+    from pipeline.run.checked_job import checked, needs_pictures, read_own_job
+    from pipeline.run.plan import Verdict, summarize
 
-    loaded, _ = checked(read_own_job(job_file, overrides, preview=preview, until=until), until)
+    loaded, findings = checked(read_own_job(job_file, overrides, preview=preview, until=until), until)
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
-    assessments, estimates, _ = assess_job(loaded.job, layout, until)
+    assessments, own, _ = assess_job(loaded.job, layout, until)
     if as_json:
         click.echo(json.dumps([assessment_as_json(each) for each in assessments], indent=1))
         return
     print_warnings(loaded.warnings)
     for line in summarize(assessments):
         click.echo(line)
-    for each in estimate(assessments, estimates):
-        click.echo(f"{each.stage}: about {wording.duration(each.seconds)} of work, {wording.size(each.bytes)}")
+    costs = costs_here(loaded.job, draws=needs_pictures(until), say=say_aside)
+    expected, without_gpu = both_ways(loaded.job, assessments, size_of(loaded.job, findings), costs, own)
+    for each in expected.stages:
+        click.echo(f"{each.stage}: about {wording.rough_duration(each.seconds)} of work{' on a GPU' * each.on_gpu}")
+    if expected.stages:
+        click.echo(f"all: {describe(expected, without_gpu)}")
+    print_warnings([warning for warning in (too_long(expected, loaded.job),) if warning])
     todo = sum(len(each.rebuilds) for each in assessments)
     at_most = "at most " if any(each.verdict is Verdict.DOWNSTREAM for each in assessments) else ""
     click.echo(f"{at_most}{todo} of {sum(len(each.task.outputs) for each in assessments)} files to make")

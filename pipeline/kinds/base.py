@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.checks.memory_budget import MemoryBudget
@@ -39,6 +39,21 @@ Materials = Callable[[str], MaterialParameters]
 """Material of a part of a body, by the name of the part."""
 
 
+class Work(NamedTuple):
+    """Work of a frame, or of one file."""
+
+    shared_s: float = 0.0  # of one core, that several share; or of the GPU [s]
+    host_s: float = 0.0  # of one core, that no other takes part in, such as launches [s]
+
+    def plus(self, other: Work) -> Work:
+        """One after the other."""
+        return Work(self.shared_s + other.shared_s, self.host_s + other.host_s)
+
+
+FrameWork = Callable[[Job, float, bool], Work]
+"""Work of a frame of all bodies of a kind, by the number of their elements, on a GPU or not."""
+
+
 class Codec(Protocol):
     """Codec of bodies that the cache does not keep array by array as they are."""
 
@@ -67,6 +82,8 @@ class Product:
     validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError
     file_bytes: Callable[[float], float]  # about the size of a file by the number of the body's elements
     about: str = ""  # what they are, in a few words for people
+    # work of a file of a job's body of so many elements
+    work: Callable[[Job, float], Work] = lambda _job, _elements: Work()
     preflight: Callable[[], list[str]] = list  # why this machine cannot make it, a sentence each
 
     def file_of(self, body: str) -> str:
@@ -97,6 +114,14 @@ class Kind:
     elements: Callable[[Job, Any], float] = lambda _job, _body: 0.0  # about how many of these a body has at most
     # size of an element in memory, in a frame of the cache, and in a checkpoint
     snapshot_bytes: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    method: Callable[[Any], str] = lambda _body: ""  # how a body is computed, where that makes a difference in time
+    # work of a frame of all bodies of a job, by the number of their elements
+    work: FrameWork = lambda _job, _elements, _on_gpu: (
+        Work()
+    )  # work of a frame of all bodies of a job, by the number of their elements
+    solver_bytes: float = 0.0  # memory of an element while it is simulated on a CPU, as measured
+    compiling_s: float = 0.0  # time of compiling its kernels on the reference machine, once [s]
+    drawing: float = 0.0  # time that its bodies add to a picture, over that of a scene of one fluid [-]
     wears: str = "rigid"  # the kind whose looks its bodies can have (`blender_scripts.look_table`)
     material: Callable[[Any], Mapping[str, MaterialParameters]]  # usual materials of the parts of a body, itself first
     # the solids that its tables place, each with the path of its table below the body's

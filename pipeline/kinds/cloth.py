@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 from pipeline.base.content import status_of, tool_version
 from pipeline.base.errors import MissingInputError
 from pipeline.base.layout import JobLayout
-from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
+from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import CLOTH_LIVE
+from pipeline.kinds.work import cloth_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
@@ -130,6 +131,7 @@ MESH = Product(
     write=_write_mesh,
     validate=validate_ply,
     file_bytes=lambda nodes: 70.0 * nodes,
+    work=lambda _job, nodes: Work(0.0, 2.0e-6 * nodes),
 )
 
 CLOTH = Kind(
@@ -139,6 +141,10 @@ CLOTH = Kind(
     size="{:,} cloth nodes",
     elements=lambda _job, cloth: count_nodes(cloth),
     snapshot_bytes=(60.0, 32.0, 54.0),
+    work=cloth_work,
+    solver_bytes=4_000.0,
+    compiling_s=90.0,
+    drawing=0.4,
     wears="cloth",
     material=lambda cloth: {BODY: LOOKS[cloth.material]},
     check=_check,

@@ -13,6 +13,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import FLUID_LIVE
+from pipeline.kinds.work import fluid_work, mean_particles, surface_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, WHITEWATER
 from pipeline.model.positions import KeyPath
@@ -158,7 +159,8 @@ SURFACE = Product(
     memory_bytes=_surface_memory,
     write=_write_surface,
     validate=validate_ply,
-    file_bytes=lambda particles: 2_500.0 * particles ** (2 / 3),
+    file_bytes=lambda particles: 4_500.0 * particles ** (2 / 3),
+    work=surface_work,
 )
 
 FLUID = Kind(
@@ -168,6 +170,11 @@ FLUID = Kind(
     size="about {:,} particles",
     elements=lambda job, fluid: most_particles_of(fluid, job),
     snapshot_bytes=(84.0, 26.0, 90.0),
+    method=lambda fluid: str(fluid.solver),
+    work=lambda job, particles, on_gpu: fluid_work(job, mean_particles(job, particles), on_gpu),
+    solver_bytes=600.0,
+    compiling_s=4.0,
+    drawing=1.0,
     wears="fluid",
     material=lambda _fluid: {BODY: MaterialParameters(look="water"), **WHITEWATER},
     placements=_placements,

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from pipeline.base.content import ABSENT, tool_version
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
-from pipeline.kinds.base import Change, Codec, Display, Kind, Materials, Product, SolidBuilder, Solids
+from pipeline.kinds.base import Change, Codec, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.work import smoke_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
@@ -125,6 +126,7 @@ VOLUME = Product(
     write=_write_volume,
     validate=validate_volume,
     file_bytes=lambda cells: 20_000 + 3.0 * cells,
+    work=lambda _job, cells: Work(0.0, 0.3e-6 * cells),
     preflight=_missing_openvdb,
 )
 
@@ -135,6 +137,10 @@ SMOKE = Kind(
     size="{:,} smoke cells",
     elements=lambda job, smoke: prod(smoke.cell_counts(job.domain)),
     snapshot_bytes=(24.0, 2.0, 26.0),
+    work=smoke_work,
+    solver_bytes=230.0,
+    compiling_s=8.0,
+    drawing=1.4,
     wears="smoke",
     material=lambda _smoke: {BODY: MaterialParameters(look="smoke")},
     placements=_placements,

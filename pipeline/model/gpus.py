@@ -21,7 +21,7 @@ from pipeline.base.parameter_set import digest_of
 from pipeline.base.task import Task
 from pipeline.model.job import Job
 from render.gpus import Gpu, Probe, find_gpus
-from sim.core.runtime import cache_folder
+from sim.core.runtime import cache_folder, cuda_gpus
 
 OWN_GPUS = "PIPELINE_GPUS"
 """Environment variable that leaves this process some of the machine's GPUs only, as `0,2`: places in Cycles' list.
@@ -34,6 +34,9 @@ _VISIBILITY = (
 """Environment variables that hide GPUs from a process, or change their order."""
 _DEVICE_FILES = ("nvidia*", "dri/renderD*", "kfd", "dxg")
 """Through which programs reach GPUs on Linux: NVIDIA's, Intel's and AMD's, AMD's for computing, those of WSL."""
+
+GPU_TASKS = 1
+"""At least one task at a time on a GPU. Whether there is one, a stage says that has to run."""
 
 TROUBLE_KEPT_S = 3600.0
 """How long an answer that was cut short is kept [s]: a driver that hangs costs two minutes each time it is asked."""
@@ -79,6 +82,12 @@ def usable_gpus(job: Job) -> tuple[Gpu, ...]:
     """Those of `render_gpus` that this process may use."""
     found, own = render_gpus(job), own_gpus()
     return found if own is None else tuple(found[place] for place in own if place < len(found))
+
+
+def gpu_count(job: Job, *, draws: bool) -> int:
+    """How many of this machine's GPUs tasks of a job may have: those that draw, else those that simulate."""
+    drawing = len(usable_gpus(job)) if draws else 0
+    return max(GPU_TASKS, drawing or len(own_gpus() or cuda_gpus()))
 
 
 def render_trouble(job: Job) -> str:

@@ -1,7 +1,7 @@
 """Disk space: how much a job will take, and how much of it stays free."""
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,8 +9,6 @@ from pipeline.base import wording
 from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
-from pipeline.record.reader import StageCost
-from pipeline.run.plan import Assessment
 
 RESERVE_BYTES = 2 * 2**30
 """Free space at which a job pauses: a checkpoint of a large simulation and a few frames fit."""
@@ -85,7 +83,7 @@ def _snapshot_bytes(size: Size, where: int) -> float:
     return sum(kind.snapshot_bytes[where] * size.elements.get(name, 0.0) for name, kind in KINDS.items())
 
 
-def _bytes_per_artifact(stage: str, size: Size) -> float:
+def bytes_per_artifact(stage: str, size: Size) -> float:
     """What one file of a stage takes, about [bytes]; those of a product of bodies by their kind."""
     for name, kind in KINDS.items():
         if kind.product is not None and kind.product.stage == stage:
@@ -93,14 +91,6 @@ def _bytes_per_artifact(stage: str, size: Size) -> float:
     return _BYTES_PER_ARTIFACT[stage](size) if stage in _BYTES_PER_ARTIFACT else 0.0
 
 
-def estimate_bytes(assessments: Iterable[Assessment], costs: Mapping[str, StageCost], size: Size) -> float:
-    """What is to be made will take, about [bytes]; by what the same stage has taken in this job, where it has."""
-    total = 0.0
-    simulated = False
-    for each in assessments:
-        stage = each.task.stage
-        cost = costs.get(stage)
-        one = cost.bytes_per_artifact if cost is not None else _bytes_per_artifact(stage, size)
-        total += one * len(each.rebuilds)
-        simulated |= stage == "simulate" and bool(each.rebuilds)
-    return total + (2 * _snapshot_bytes(size, 2) if simulated else 0.0)  # two checkpoints are kept
+def checkpoint_bytes(size: Size) -> float:
+    """What checkpoints of a simulation take, of which two are kept [bytes]."""
+    return 2 * _snapshot_bytes(size, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -26,6 +27,7 @@ from pipeline.run.executors.failures import is_disk_full
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
     from pipeline.model.job import Job
+    from pipeline.queue.cost import Expectation
     from pipeline.queue.disk import Size
     from pipeline.queue.job_queue import QueuedJob
     from pipeline.run.assessment import JobAssessment
@@ -78,7 +80,7 @@ def submit(loaded: LoadedJob, layout: JobLayout, *, options: QueueOptions, until
         loaded, findings = checked(loaded, until)
         print_warnings(loaded.warnings)
         if state is not None:
-            _say_what_it_takes(state, size_of(loaded.job, findings), layout, options.reserve_bytes)
+            _say_what_it_takes(loaded.job, state, size_of(loaded.job, findings), layout, options, until=until)
     if is_finished(state, layout, loaded.text, until):
         from pipeline.queue.endings import say_finished
 
@@ -127,7 +129,7 @@ def run(
         if options.cores is not None:
             raise click.UsageError("--cores is for this machine; on a cluster the workers' tags say what they offer")
         require_named_devices(job, todo)
-    _make_folder(layout)
+    make_folder(layout)
     check_places(layout)
     queue = JobQueue.of(layout)
     name = checked_name(layout.root.absolute().name)
@@ -202,20 +204,52 @@ def is_finished(state: JobAssessment | None, layout: JobLayout, text: str | None
     )
 
 
-def _say_what_it_takes(state: JobAssessment, size: Size, layout: JobLayout, reserve_bytes: int | None) -> None:
-    """Say how much a job will write, about, and warn if the disk has no room for it."""
-    from pipeline.queue import disk
+def _say_what_it_takes(
+    job: Job, state: JobAssessment, size: Size, layout: JobLayout, options: QueueOptions, *, until: Sequence[str] = ()
+) -> None:
+    """Say how long a job will take, what disk space and memory, and warn if that is days, or more than there is.
+
+    On a cluster only the disk space is told: how fast its machines are is theirs to know.
+    """
+    from pipeline.queue import cost, disk
+    from pipeline.run.checked_job import needs_pictures
 
     folder = next(each for each in (layout.root.absolute(), *layout.root.absolute().parents) if each.is_dir())
     free = disk.free_bytes(folder)
-    takes = disk.estimate_bytes(state.assessments, state.costs, size)
+    costs = cost.costs_here(job, draws=needs_pictures(until), cores=options.cores, say=say_aside)
+    expected, without_gpu = cost.both_ways(job, state.assessments, size, costs, state.costs)
+    takes = expected.disk_bytes
     if takes:
-        click.echo(f"about {wording.size(takes)} to write; {wording.size(free)} are free", err=True)
-    reserve = disk.usual_reserve_bytes(folder) if reserve_bytes is None else reserve_bytes
+        told = f"about {wording.size(takes)} to write; {wording.size(free)} are free"
+        here = options.choice.scheduler is None
+        say_aside(f"{cost.describe(expected, without_gpu)}; {wording.size(free)} of disk are free" if here else told)
+        warning = cost.too_long(expected, job) if here else None
+        print_warnings([warning] if warning else [])
+    reserve = disk.usual_reserve_bytes(folder) if options.reserve_bytes is None else options.reserve_bytes
     if takes > free - reserve:
         print_warnings(
             [f"the disk may be too small: the job pauses when only the reserve of {wording.size(reserve)} is left"]
         )
+
+
+def first_cost(job: Job, size: Size, until: Sequence[str] = ()) -> tuple[Expectation, Expectation | None]:
+    """What a job takes that was never submitted; see `cost.both_ways`.
+
+    Raises StageUnavailableError: it cannot be planned here, as for want of a Blender.
+    """
+    from pipeline.queue import cost
+    from pipeline.run.checked_job import needs_pictures
+    from pipeline.run.plan import assess, plan_job
+    from pipeline.stages import STAGES
+
+    tasks = plan_job(job, JobLayout(Path(job.name)), STAGES, until)
+    assessments = assess(tasks, {}, {}, parameters=lambda _: None)
+    return cost.both_ways(job, assessments, size, cost.costs_here(job, draws=needs_pictures(until), say=say_aside))
+
+
+def say_aside(sentence: str) -> None:
+    """On the error stream, so that output stays fit for a pipe."""
+    click.echo(sentence, err=True)
 
 
 def _keep(submitted: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
@@ -230,7 +264,8 @@ def _keep(submitted: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
         raise PipelineError(f"cannot copy {error.filename} into {layout.root}: {error.strerror}") from error
 
 
-def _make_folder(layout: JobLayout) -> None:
+def make_folder(layout: JobLayout) -> None:
+    """Make a job's folder, if it is not there. Raises PipelineError: it cannot be written to."""
     try:
         layout.root.mkdir(parents=True, exist_ok=True)
         probe = layout.root / ".writable"

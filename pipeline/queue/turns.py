@@ -12,8 +12,9 @@ from pipeline.base.lease import Lease
 from pipeline.base.resources import machine_capacity
 from pipeline.base.wording import print_warnings
 from pipeline.job.loading import job_of_text, load_job
-from pipeline.model.gpus import own_gpus, render_trouble, usable_gpus
+from pipeline.model.gpus import gpu_count, render_trouble
 from pipeline.model.job import Job
+from pipeline.queue.cost import Costs, Teacher
 from pipeline.queue.endings import tell_end
 from pipeline.queue.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
 from pipeline.queue.following import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
@@ -26,19 +27,10 @@ from pipeline.run.events import JobOutcome, Observer, Outcome
 from pipeline.run.executors.attempt import STAGES_REFERENCE
 from pipeline.run.executors.choice import ExecutorChoice, open_machines
 from pipeline.run.progress import ProgressObserver, open_display
+from pipeline.run.rates import known_rates
 from pipeline.run.runner import run_job
 from pipeline.run.solver_numbers import SolverWatch
 from pipeline.stages import STAGES
-from sim.core.runtime import cuda_gpus
-
-GPU_TASKS = 1
-"""At least one task at a time on a GPU. Whether there is one, a stage says that has to run."""
-
-
-def gpu_count(job: Job, *, draws: bool) -> int:
-    """How many of this machine's GPUs tasks of a job may have: those that draw, else those that simulate."""
-    drawing = len(usable_gpus(job)) if draws else 0
-    return max(GPU_TASKS, drawing or len(own_gpus() or cuda_gpus()))
 
 
 def stand_in_queue(queue: JobQueue, layout: JobLayout, entry: QueuedJob, *, detach: bool) -> int:
@@ -189,6 +181,10 @@ def _run_once(
         if draws_here and (trouble := render_trouble(job)):
             warn(f"{trouble}; frames are drawn on the processor")
         observers: list[Observer] = [progress.notify, SolverWatch(layout, warn).notify]
+        if choice.scheduler is None and (rates := known_rates()) is not None:
+            teacher = Teacher(job, layout, Costs(rates, capacity))
+            stack.callback(teacher.teach)
+            observers.append(teacher.notify)
         if observer is not None:
             observers.append(observer)
         observers.append(stack.enter_context(PreviewMovie(job, layout, progress.display.say, warn)).notify)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -18,7 +18,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet, explain_difference
 from pipeline.base.paused_gc import many_objects
 from pipeline.base.task import ArtifactPath, Task, TaskId, task_fingerprint
-from pipeline.record.reader import ArtifactRow, StageCost
+from pipeline.record.reader import ArtifactRow
 from pipeline.record.reconcile import FileCondition, FileProblem
 
 if TYPE_CHECKING:
@@ -63,14 +63,6 @@ class Assessment:
     reasons: tuple[Reason, ...] = ()  # why; empty if it is up to date
     # the outputs that would be made, or made anew. Of a checkpointed task only those that need it
     rebuilds: tuple[ArtifactPath, ...] = ()
-
-
-class Estimate(NamedTuple):
-    """What a stage's share of a plan would take: time of one task after the other [s], and disk space."""
-
-    stage: str
-    seconds: float
-    bytes: float
 
 
 def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequence[str] = ()) -> list[Task]:
@@ -356,21 +348,6 @@ def frame_ranges(frames: Iterable[int], planned: Iterable[int]) -> str:
         else:
             runs.append([frame])
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
-
-
-def estimate(assessments: Iterable[Assessment], costs: Mapping[str, StageCost]) -> list[Estimate]:
-    """What the plan would take, per stage, going by what the same stage has taken before (`stage_costs`), where it has.
-
-    Tasks that run only if their inputs differ count in full.
-    """
-    counts: Counter[str] = Counter()
-    for each in assessments:
-        counts[each.task.stage] += len(each.rebuilds)
-    return [
-        Estimate(stage, costs[stage].seconds_per_artifact * count, costs[stage].bytes_per_artifact * count)
-        for stage, count in counts.items()
-        if count and stage in costs
-    ]
 
 
 def _abridge(reasons: Iterable[Reason]) -> tuple[Reason, ...]:

@@ -9,7 +9,7 @@ die with it, and the lease of a dead process counts for nothing.
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from pipeline.base.errors import DamagedManifestError, DiskFullError, PlanError
@@ -32,6 +32,7 @@ from pipeline.run.executors.failures import is_disk_full
 from pipeline.run.goal import write_goal
 from pipeline.run.plan import Assessment, Verdict, assess, frame_turns, plan_job, up_to_date
 from pipeline.run.scheduler import Scheduler
+from pipeline.run.sharing import Shared, take_over_shared
 from pipeline.store.artifacts import sweep_parts
 from render.temporary_folder import remove_folders_of_the_dead
 
@@ -154,10 +155,20 @@ def _begin(
         clean = manifest.begin_run(job.name, run=lease.holder.token)
         if lease.takeover is not None:
             manifest.log_event("takeover", lease.takeover)
-        return manifest, tasks, forced, reconcile(manifest, layout, clean=clean)
+        shared = take_over_shared(layout, [task for task in tasks if task.id not in forced])
+        return manifest, tasks, forced, _agreed(manifest, layout, shared, clean=clean)
     except BaseException:
         manifest.close()
         raise
+
+
+def _agreed(manifest: Manifest, layout: JobLayout, shared: Shared, *, clean: bool) -> Reconciliation:
+    """Record and files brought together, those that were taken over among them."""
+    reconciliation = reconcile(manifest, layout, clean=clean and not shared.files)
+    if not shared.files:
+        return reconciliation
+    manifest.log_event("shared", str(shared))
+    return replace(reconciliation, sentences=(str(shared), *reconciliation.sentences))
 
 
 def _made_anew(layout: JobLayout) -> str:

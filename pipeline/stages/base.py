@@ -1,13 +1,14 @@
 """What a stage is, and what it gets to run a task with."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
+from pipeline.kinds.base import Work
 from pipeline.model.job import Job
 
 
@@ -47,6 +48,20 @@ class TaskContext(Protocol):
         """Whether the task should checkpoint and return."""
 
 
+FILE_S = 0.04
+"""Time of a small file: reading what it is made of, checking it, and its share of a worker's start [s]."""
+
+
+class FileWork(NamedTuple):
+    """What making a file of a stage takes on the reference machine of `pipeline.kinds.work`."""
+
+    what: str = ""  # in a word, for what is learnt of it
+    work: Work = Work()
+    start_s: float = 0.0  # time before the first file [s]
+    compiling_s: float = 0.0  # the same where it never ran before, for compiling [s]
+    memory_bytes: float | None = None  # of a task; None: as it claims
+
+
 class Stage(Protocol):
     """A stage of the pipeline: one file here, one line in STAGES."""
 
@@ -70,6 +85,10 @@ class Stage(Protocol):
     def lighter(self, job: Job) -> str:  # noqa: ARG002
         """What of a job its tasks need less memory with, for people; empty if nobody can say."""
         return ""
+
+    def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
+        """What a file takes of a job with so many elements of each kind of body."""
+        return FileWork()
 
     @abstractmethod
     def run(self, context: TaskContext) -> None:

@@ -1,18 +1,24 @@
 """Bodies: the mesh of each rigid body in its rest pose, for the renderer."""
 
+from collections.abc import Mapping
+
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Task, TaskId
+from pipeline.kinds.base import Work
 from pipeline.kinds.table import material_of
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
-from pipeline.stages.base import Stage, TaskContext
+from pipeline.stages.base import FileWork, Stage, TaskContext
 from pipeline.stages.inputs import by_content
 from render.meshes import validate_ply, write_ply
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.parameters import MeshShape
 from sim.shapes.solid import TriangleMesh
+
+MESH_S = 2.0
+"""Time of meshing a body, its worker's start included [s]."""
 
 
 class BodiesStage(Stage):
@@ -42,6 +48,10 @@ class BodiesStage(Stage):
             )
             for body in job.rigid
         ]
+
+    def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
+        """A mesh of a shape."""
+        return FileWork("mesh", Work(0.0, MESH_S))
 
     def run(self, context: TaskContext) -> None:
         """Mesh one body."""

@@ -1,16 +1,22 @@
 """Movie: pictures into segments, segments into the film."""
 
+from collections.abc import Mapping
 from functools import partial
+from math import prod
 from pathlib import Path
 
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Task, TaskId
+from pipeline.kinds.base import Work
 from pipeline.model.job import Job
-from pipeline.stages.base import Stage, TaskContext
+from pipeline.stages.base import FileWork, Stage, TaskContext
 from render.continuity import Continuity
 from render.movie import SEGMENT_FRAMES, encode_segment, join_segments, missing_encoder, validate_movie
+
+PIXEL_S = 25e-9
+"""Time of encoding a pixel, and of reading its picture [s]."""
 
 
 class MovieStage(Stage):
@@ -52,6 +58,10 @@ class MovieStage(Stage):
             parameters=parameters,
         )
         return [*segments, film]
+
+    def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
+        """By the pixels of a segment and of the film."""
+        return FileWork("film", Work(0.0, PIXEL_S * prod(job.render.resolution) * min(job.frame_count, SEGMENT_FRAMES)))
 
     def preflight(self, job: Job) -> list[str]:
         """An encoder that this build of FFmpeg lacks."""

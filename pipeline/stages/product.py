@@ -1,12 +1,14 @@
 """The stages that make one file of each body of a kind and frame: surfaces, cloths, volumes."""
 
+from collections.abc import Mapping
+
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Resources, Task, TaskId
-from pipeline.kinds.base import Kind, Product
+from pipeline.kinds.base import Kind, Product, Work
 from pipeline.model.job import Job
-from pipeline.stages.base import Stage, TaskContext
+from pipeline.stages.base import FILE_S, FileWork, Stage, TaskContext
 from pipeline.store.cache import read_compact
 
 
@@ -49,6 +51,11 @@ class ProductStage(Stage):
     def lighter(self, job: Job) -> str:  # noqa: ARG002
         """What the kind says."""
         return self._kind.lighter
+
+    def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
+        """What the kind says of a body with the mean number of elements."""
+        count = elements.get(self._kind.name, 0.0) / max(1, len(self._kind.bodies(job)))
+        return FileWork(self._kind.name, self._product.work(job, count).plus(Work(0.0, FILE_S)))
 
     def run(self, context: TaskContext) -> None:
         """Make the file of one body and frame."""

@@ -1,8 +1,8 @@
 """Render: each frame of the job, drawn by Blender's Cycles."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
-from math import prod
+from math import prod, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.job.input_files import split_blend
-from pipeline.kinds.table import material_of, products_of
+from pipeline.kinds.base import Work
+from pipeline.kinds.table import KINDS, material_of, products_of
 from pipeline.model.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, parts_of
 from pipeline.model.problems import suggestion
-from pipeline.stages.base import Stage, TaskContext
+from pipeline.stages.base import FileWork, Stage, TaskContext
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render_drawing import CPU, FrameDrawing, close_renderers, may_be_empty
 from pipeline.stages.render_scene import render_spec, write_motion
@@ -35,6 +36,21 @@ CORES = 2  # threads a frame: Cycles with one keeps a second busy waiting. The p
 WORKER_BYTES = 500_000_000
 BYTES_PER_PIXEL = 700
 """Measured peaks of the quickstart with denoising, Blender included: 538 MB at 480 x 270 and 1880 MB at 1920 x 1080."""
+
+SAMPLES = {"draft": 6, "preview": 48, "final": 256}
+"""Most samples of a pixel by quality, as `blender_scripts.settings` has them; a test holds them together."""
+FULL_SAMPLES = 48
+"""Beyond so many samples most pixels have had enough: the mean grows with the root."""
+SAMPLE_S, GPU_SAMPLE_S = 4e-6, 0.04e-6
+"""Time of a sample of a pixel in a scene of one fluid: of a core of the reference machine, and of an H200 [s]."""
+FRAME_S, GPU_FRAME_S = 3.0, 2.0
+"""Time of a picture besides: building the scene, denoising, writing and checking [s]."""
+START_S = 10.0
+"""Time of Blender's start and of the first picture's kernels [s]."""
+EMPTY_SET = 0.4
+"""What ground, sky and lights take of the time of a scene of one fluid, besides what is in it [-]."""
+VOLUME_FACTORS = {"draft": 1.0, "preview": 2.0, "final": 5.0}
+"""What volumes take more where light is scattered in them, by quality [-]."""
 
 COMBINED = "ViewLayer.Combined"  # Blender's name for the picture's layer among passes
 
@@ -92,6 +108,16 @@ class RenderStage(Stage):
             for frame in range(job.frame_count)
         ]
 
+    def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
+        """By pixels, samples and what takes the longest of what is drawn."""
+        there = [kind for kind in KINDS.values() if kind.bodies(job)]
+        content = EMPTY_SET + max((kind.drawing for kind in there), default=0.0)
+        samples = effective_samples(job.render.quality, job.render.samples)
+        seconds = prod(job.render.resolution) * samples * content * (GPU_SAMPLE_S if on_gpu else SAMPLE_S)
+        seconds *= VOLUME_FACTORS[job.render.quality] if any(kind.drawing > 1.0 for kind in there) else 1.0
+        what = "+".join([job.render.quality, *(kind.name for kind in there if kind.drawing)])
+        return FileWork(what, Work(seconds, GPU_FRAME_S if on_gpu else FRAME_S), START_S)
+
     def preflight(self, job: Job) -> list[str]:
         """No Blender, one that is too old or lacks a shared library, or one without the material or GPU asked for."""
         try:
@@ -139,6 +165,12 @@ class RenderStage(Stage):
             raise
         layout.rejected_picture(task.frame).unlink(missing_ok=True)
         context.progress(1, 1)
+
+
+def effective_samples(quality: str, samples: int | None) -> float:
+    """Mean samples of a pixel, fewer than the most that it may have where noise is soon gone."""
+    most = samples or SAMPLES[quality]
+    return min(most, FULL_SAMPLES) * sqrt(max(1.0, most / FULL_SAMPLES))
 
 
 def _draws_on_gpus(job: Job) -> bool:

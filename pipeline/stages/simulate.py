@@ -19,9 +19,10 @@ from pipeline.base.files import make_folder, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.kinds.base import Work
 from pipeline.kinds.table import KINDS, bodies, world_of
 from pipeline.model.job import Job
-from pipeline.stages.base import Stage, TaskContext
+from pipeline.stages.base import FileWork, Stage, TaskContext
 from pipeline.stages.inputs import by_content
 from pipeline.stages.ordered_writer import WAITING, OrderedWriter
 from pipeline.store.cache import (
@@ -50,13 +51,20 @@ that, the newest before it finds a place in the queue, and what goes into its ma
 WORKER_BYTES = 800_000_000
 """Interpreter, compiler and the driver's share of the host's memory; an estimate, on the safe side."""
 
+CPU_WORKER_BYTES = 360_000_000
+"""The same of a simulation on the CPU, as measured without any body."""
+COMPILER_BYTES_PER_S = 4e6
+"""Memory of compiling, over the time that it takes."""
+START_S = 5.0
+"""Time of a worker's start, of building the world and of loading its kernels [s]."""
+
 
 class SimulateStage(Stage):
     """One task for the whole job: it commits a frame at a time and continues where it stopped."""
 
     name = "simulate"
     about = "the physics, frame by frame"
-    version = 13
+    version = 14
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""
@@ -95,6 +103,17 @@ class SimulateStage(Stage):
     def lighter(self, job: Job) -> str:
         """What every kind of body in the job says."""
         return " or ".join(kind.lighter for kind in KINDS.values() if kind.lighter and kind.bodies(job))
+
+    def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:
+        """What every kind of body in the job says."""
+        there = [kind for kind in KINDS.values() if kind.bodies(job)]
+        work, memory = Work(), float(WORKER_BYTES if on_gpu else CPU_WORKER_BYTES)
+        for kind in there:
+            count = elements.get(kind.name, 0.0)
+            work = work.plus(kind.work(job, count, on_gpu))
+            memory += 0.0 if on_gpu else kind.solver_bytes * count + COMPILER_BYTES_PER_S * kind.compiling_s
+        what = "+".join(sorted({kind.method(body) or kind.name for kind in there for body in kind.bodies(job)}))
+        return FileWork(what, work, START_S, max((kind.compiling_s for kind in there), default=0.0), memory)
 
     def run(self, context: TaskContext) -> None:
         """Compute the frames that are not committed yet.

@@ -23,10 +23,12 @@ an older attempt finds the newer receipt and gives up. The lock is a `flock` on 
 kernel drops it with its holder, so none is ever left behind.
 """
 
+import errno
 import fcntl
 import os
 import platform
 import re
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -34,7 +36,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
-from pipeline.base.files import make_folder, sync
+from pipeline.base.files import make_folder, replace_durably, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
 from pipeline.store.provenance import keep_texts, maker
@@ -42,6 +44,8 @@ from pipeline.store.receipts import Receipt, hash_file, read_receipt, verify_art
 
 _PART_NAME = re.compile(r"^\..+\.part\.\d+(-journal)?$")
 _LOCK_NAME = ".lock"
+_NO_HARD_LINKS = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS)
+"""Two file systems, one without hard links, or too many names of a file."""
 
 
 def edited_name(layout: JobLayout, artifact: ArtifactPath) -> ArtifactPath:
@@ -153,6 +157,44 @@ def committing(
         for part in (commit.path, receipt_part):
             with suppress(OSError):  # must not hide the error that is on its way; sweep_parts gets what stays
                 part.unlink(missing_ok=True)
+
+
+def take_over(layout: JobLayout, receipt: Receipt, owner: JobLayout) -> None:
+    """Commit an artifact that another job has made: the same file under a second name, and its receipt beside it.
+
+    A copy, where the file system has no hard links, or the folders lie on two. The texts that the receipt names come
+    along. In the order of `committing`, and as safe. Nobody writes into an artifact: what is made anew takes its name,
+    and leaves the other job's alone.
+    """
+    target, receipt_path = layout.path(receipt.artifact), layout.receipt(receipt.artifact)
+    for text, kept in (
+        (owner.job_text(receipt.job), layout.job_text(receipt.job)),
+        (owner.parameters_text(receipt.parameters), layout.parameters_text(receipt.parameters)),
+    ):
+        if text.is_file() and not kept.exists():
+            make_folder(kept.parent, within=layout.root)
+            replace_durably(kept, text.read_bytes())
+    make_folder(target.parent, within=layout.root)
+    make_folder(receipt_path.parent, within=layout.root)
+    part = _part_path(target, receipt.attempt)
+    part.unlink(missing_ok=True)
+    source = owner.path(receipt.artifact)
+    try:
+        os.link(source, part)
+    except OSError as error:
+        if error.errno not in _NO_HARD_LINKS:
+            raise
+        shutil.copy2(source, part)
+        sync(part)
+    try:
+        with _lock(receipt_path.with_name(_LOCK_NAME)):
+            _fence(layout, receipt)
+            _invalidate(layout, receipt.artifact)
+            part.replace(target)
+            sync(target.parent)
+            replace_durably(receipt_path, receipt.to_json())
+    finally:
+        part.unlink(missing_ok=True)  # a second name of the same file is not renamed onto the first
 
 
 def sweep_parts(layout: JobLayout) -> list[Path]:

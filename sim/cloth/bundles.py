@@ -153,8 +153,6 @@ class Pieces(NamedTuple):
 
     segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
     piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
-    piece: Integers  # of each spring, (s,)
-    spring_of_colour: Integers  # first spring of each colour, and number of springs, (colours + 1,)
     is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
 
 
@@ -162,13 +160,8 @@ class Pieces(NamedTuple):
 class ThreadWork(NamedTuple):
     """Numbers of each spring of threads within a substep, (s,) each."""
 
-    direction: Vectors
-    lower: Floats  # of the tridiagonal system, then its factors
-    diagonal: Floats  # of that system; then inverse mass of the node that the spring leads to [1/kg]
-    change: Floats  # of the multiplier
     multiplier: Floats
     tension: Floats  # too much of it, over the length
-    solved: Vectors  # [m]
 
 
 @bundle

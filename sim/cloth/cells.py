@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.cloth.colouring import greedy_colours
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet, triangle_areas
 
@@ -32,13 +31,13 @@ Indices = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of as many nodes each; those of one colour share no node.
+    """Cells of as many nodes each; rectangles of one colour share no node.
 
     Attributes:
         nodes: (m, arity) int32; three of triangles, four of rectangles.
         along, across: c_a of d_u and d_v [1/m], (m, arity).
         area: [m²], (m,).
-        colour: (m,).
+        colour: (m,); 0 of triangles, which are solved together.
         swapped: whether warp and weft of a cell are weft and warp of the node, (m, arity); of triangles whose node has
             them from its first one: on curved sheets they may change places.
     """
@@ -144,7 +143,7 @@ def _triangles(sheet: RestSheet) -> Cells:
         along,
         across,
         triangle_areas(sheet.vertices, sheet.triangles),
-        greedy_colours(nodes, len(sheet.vertices)),
+        np.zeros(len(nodes), dtype=np.int32),
         _swapped(sheet, normal),
     )
 

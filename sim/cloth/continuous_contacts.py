@@ -145,8 +145,9 @@ class ContinuousContacts:
         n, first = state.vertex_count, state.host.first_node
         velocity = box_of(state.velocity, 0, n, self._ends)
         shortest = self.rigid.stable_dt(
-            *velocity,
-            lambda: box_of(state.position, 0, n, self._ends),
+            state,
+            range(n),
+            velocity,
             at_most=self._little_motion(velocity, at_most) if self._meets_cloth else at_most,
         )
         if shortest == at_most or len(state.names) == 1:
@@ -156,10 +157,10 @@ class ContinuousContacts:
             for vectors in (state.velocity, state.position)
         )
         shortest = at_most
-        for number, (velocity, place) in enumerate(zip(velocities, places, strict=True)):
+        for number, velocity in enumerate(velocities):
             if state.self_collision[number]:
                 shortest = self._little_motion(velocity, shortest)
-            shortest = self.rigid.stable_dt(*velocity, lambda place=place: place, at_most=shortest)
+            shortest = self.rigid.stable_dt(state, range(*first[number : number + 2]), velocity, at_most=shortest)
         for a, b in combinations(range(len(state.names)), 2):
             apart, closing = (
                 np.abs(each[a][0] - each[b][0]) + sign * (each[a][1] + each[b][1])

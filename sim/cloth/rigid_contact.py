@@ -1,7 +1,6 @@
 """Cloth against rigid bodies and walls: what touches in a substep."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,18 +17,23 @@ from sim.cloth.bundles import (
     Surface,
     Three,
     Walls,
+    Weights,
 )
+from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
+from sim.cloth.self_collision import Box
 from sim.cloth.self_collision_kernels import lanes_of_pair
 from sim.cloth.state import ClothState
-from sim.core.arrays import Floats, Integers
+from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
+from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.motion.paths import Poses
-from sim.core.scheduling import begin_sharing, next_item, workers_for
+from sim.core.reductions import LaneReduction, Share, reduced
+from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
 from sim.core.walls import Wall
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.device_shapes import GRID, SPHERE, TORUS, Shapes, distance_to
@@ -40,8 +44,8 @@ PATCHES_AT_A_TIME = 4
 """Patches that a thread takes at a time: those that touch a body take some microseconds each."""
 
 LARGEST_ADVANCE = 0.25
-"""How far cloth and bodies that it may meet may move against each other in a step, in half shortest edges of the
-smallest body."""
+"""How far cloth and a body that it may meet may move against each other in a step, in half shortest edges of that
+body."""
 
 WALL_DEPTH = 4.0
 """Walls hold what is at most so far behind them, in thicknesses, or as far as a mean edge or the node's motion in the
@@ -103,13 +107,19 @@ class RigidContact:
     def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float], walls: Sequence[Wall]) -> None:
         self.bodies = CollisionBodies(geometries, friction)
         self._motion: BodyMotion | None = None
-        self._shortest_edge = min((geometry.shortest_edge for geometry in geometries), default=math.inf)
+        self._advance = LARGEST_ADVANCE * 0.5 * np.array([geometry.shortest_edge for geometry in geometries])
+        self._advance_on_device = ti.ndarray(ti.f32, max(len(geometries), 1))
+        self._moving = ti.Vector.ndarray(4, ti.f32, max(len(geometries), 1))
+        self._rates = LaneReduction(maxima=1, sums=0)
+        self._is_warm = False  # `fastest_approach` is compiled in the first step, not in the first fast one
         self._radius = np.array([geometry.radius for geometry in geometries])
-        self._position = self._velocity = np.zeros((len(geometries), 3))
+        self._velocity = np.zeros((len(geometries), 3))
         self._spin_speed = np.zeros(len(geometries))
         self._shows = np.zeros(len(geometries), dtype=bool)
         self._spacing, self._longest, self._largest_half = 0.0, 0.0, 0.0
         self._taken = ti.ndarray(ti.i32, 2)
+        if geometries:
+            put(self._advance_on_device, self._advance)
         room = max(len(walls), 1)
         corners = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(4))
         self._walls = Walls(len(walls), ti.Vector.ndarray(4, ti.f32, room), *corners)
@@ -145,7 +155,7 @@ class RigidContact:
         """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
         b = self.bodies.count
         inverse_mass, inverse_inertia = np.zeros(b), np.zeros((b, 3, 3))
-        self._position, self._velocity, self._spin_speed = poses.position[:b], np.zeros((b, 3)), np.zeros(b)
+        self._velocity, self._spin_speed = np.zeros((b, 3)), np.zeros(b)
         self._motion = motion
         if motion is not None:
             m = len(motion.velocity)
@@ -164,29 +174,39 @@ class RigidContact:
             turn[:m] = dt * motion.angular_velocity
             self.bodies.set_motion(shift, turn)
 
-    def stable_dt(
-        self, velocity: Array, spread: Array, box: Callable[[], tuple[Array, Array]], *, at_most: float
-    ) -> float:
-        """Largest step [s] for cloth that moves like this.
+    def stable_dt(self, state: ClothState, nodes: range, box: Box, *, at_most: float) -> float:
+        """Largest step [s] for some nodes, of one cloth or of several.
 
-        A body that is not near the cloth's box may come half of the way in a step.
+        A node that is not near a body may come half of the way in a step.
 
         Args:
-            velocity, spread: middle and half edges of the box around its velocities [m/s], (3,).
-            box: middle and half edges of the box around it [m], (3,) each; asked for if it matters.
+            state: at the start of a step.
+            nodes: numbers of those that are looked at.
+            box: middle and half edges of the box around their velocities [m/s], (3,) each; nodes are looked at one by
+                one where all of them as fast as any and near the bodies would need shorter steps.
             at_most: the largest step otherwise [s].
         """
-        speed = np.linalg.norm(np.abs(velocity) + spread)
-        both = speed + np.linalg.norm(self._velocity, axis=1) + self._spin_speed
-        limits = LARGEST_ADVANCE * 0.5 * self._shortest_edge / np.maximum(both, 1.0e-30)
-        fast = np.flatnonzero(limits < at_most)
-        if len(fast):
-            middle, half = box()
-            beyond = np.maximum(np.abs(self._position[fast] - middle) - half, 0.0)
-            room = np.linalg.norm(beyond, axis=1) - self._radius[fast] - self._largest_half
-            closing = np.linalg.norm(np.abs(self._velocity[fast] - velocity) + spread, axis=1)
-            limits[fast] = np.maximum(limits[fast], 0.5 * room / np.maximum(closing, 1.0e-30))
-        return min(at_most, float(limits.min(initial=math.inf)))
+        if not self.bodies.count:
+            return at_most
+        speed = np.linalg.norm(np.abs(box[0]) + box[1])
+        rates = (speed + np.linalg.norm(self._velocity, axis=1) + self._spin_speed) / self._advance
+        if self._is_warm and rates.max() * at_most <= 1.0:
+            return at_most
+        self._is_warm = True
+        put(self._moving, np.concatenate([self._velocity, self._spin_speed[:, None]], axis=1))
+        rate = fastest_approach(
+            self._rates.over(len(nodes)),
+            nodes.start,
+            len(nodes),
+            state.position,
+            state.velocity,
+            self.bodies.colliding,
+            self._moving,
+            self._advance_on_device,
+            self._largest_half,
+            is_short(len(nodes), NODE_NS),
+        )
+        return min(at_most, 1.0 / max(float(rate), 1.0e-30))
 
     def find(
         self,
@@ -226,6 +246,43 @@ class RigidContact:
             bool(self._shows.any()),
         )
         return found
+
+
+@kernel
+def fastest_approach(
+    share: Share,
+    first: ti.i32,
+    count: ti.i32,
+    position: Vectors,
+    velocity: Vectors,
+    bodies: CollidingBodies,
+    moving: Weights,
+    advance: Floats,
+    half: ti.f32,
+    is_short: ti.template(),
+) -> ti.f32:
+    """Largest inverse of the step that a node and a body bear [1/s].
+
+    `moving` has the velocity of each body's centre of mass and the speed by which it turns [m/s], `advance` how far
+    what is near may move against it [m].
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for lane in range(share.tree.lanes):
+        largest = 0.0
+        for k in range(share.items):
+            n = lane * share.lane_step + k * share.item_step
+            if n < count:
+                i = first + n
+                for b in range(bodies.count):
+                    relative = (velocity[i] - moving[b].xyz).norm()
+                    rate = (relative + moving[b].w) / advance[b]
+                    room = (position[i] - bodies.position[b]).norm() - bodies.radius[b] - half
+                    if room > 0.0:
+                        rate = ti.min(rate, 2.0 * relative / room)
+                    largest = ti.max(largest, rate)
+        share.tree.partial[lane] = largest
+    return reduced(share.tree.partial, share.tree.lanes, 1, 1, share.tree.nodes)[0]
 
 
 @func

@@ -1,4 +1,4 @@
-"""Threads of a cloth, solved piece by piece instead of spring by spring."""
+"""Threads of rectangles on a GPU, solved piece by piece instead of spring by spring."""
 
 import numpy as np
 import taichi as ti
@@ -9,7 +9,7 @@ from sim.cloth.spring_convergence import measure_excess
 from sim.cloth.state import ClothState
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import LaneReduction, runs_on_gpu
+from sim.core.reductions import LaneReduction
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
@@ -29,8 +29,8 @@ class ThreadSolver:
     """Block Gauss-Seidel: pieces of a thread of some springs each, colour by colour, every piece exactly.
 
     The multipliers of a piece follow from a tridiagonal system (Deul et al. 2018, "Direct position-based solver for
-    stiff rods", here without branches), which the Thomas algorithm solves in one pass forth and one back. A thread acts
-    as a chain of pieces instead of one of springs, and stretches less by the length of a piece.
+    stiff rods", here without branches). A thread acts as a chain of pieces instead of one of springs, and stretches
+    less by the length of a piece.
 
     Directions are those of the start, as in SHAKE (Ryckaert, Ciccotti & Berendsen 1977): then a swinging sheet keeps
     its energy, of which directions of the prediction take a part in every step. Springs that turn far in a step, as
@@ -41,26 +41,16 @@ class ThreadSolver:
     its corner would jitter there. `straighten` therefore lets a part of what is more turn with its springs, as in
     Newmark's implicit scheme.
 
-    On a GPU a block of its threads solves a piece by parallel cyclic reduction (Hockney 1965; Zhang, Cohen & Owens
-    2010, "Fast tridiagonal solvers on the GPU"), a row each. Elsewhere what can be done spring by spring is, and the
-    passes along the pieces read nothing but a few numbers that lie together. Kernels here and in `xpbd` write
-    x = x + y: what stands at an index from memory Taichi would add to by an atomic operation for +=.
+    For GPUs: a block of their threads solves a piece by parallel cyclic reduction (Hockney 1965; Zhang, Cohen & Owens
+    2010, "Fast tridiagonal solvers on the GPU"), a row each. A CPU does the same in `row_threads`. Kernels here and in
+    `xpbd` write x = x + y: what stands at an index from memory Taichi would add to by an atomic operation for +=.
     """
 
     def __init__(self, springs: DeviceSprings) -> None:
         self.springs = springs
         starts = springs.segment_start.to_numpy()
-        direction, solved = (ti.Vector.ndarray(3, ti.f32, springs.count) for _ in range(2))
-        self._work = ThreadWork(direction, *(ti.ndarray(ti.f32, springs.count) for _ in range(5)), solved)
-        self._pieces = Pieces(
-            springs.segment_start,
-            springs.piece_of_colour,
-            ti.ndarray(ti.i32, springs.count),
-            ti.ndarray(ti.i32, springs.piece_of_colour.shape[0]),
-            ti.ndarray(ti.i32, len(starts) - 1),
-        )
-        self._pieces.piece.from_numpy(np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts)))
-        self._pieces.spring_of_colour.from_numpy(starts[springs.piece_of_colour.to_numpy()])
+        self._work = ThreadWork(*(ti.ndarray(ti.f32, springs.count) for _ in range(2)))
+        self._pieces = Pieces(springs.segment_start, springs.piece_of_colour, ti.ndarray(ti.i32, len(starts) - 1))
         self._excess = LaneReduction(maxima=1, sums=1)
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
@@ -71,11 +61,9 @@ class ThreadSolver:
         springs = self.springs
         springs.contract(state.nodes, state.displacement)
         for colour in springs.first_colours:
-            arguments = (springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work)
-            if runs_on_gpu():
-                solve_threads_in_blocks(*arguments, self._rows)
-            else:
-                solve_threads(*arguments)
+            solve_threads(
+                springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work, self._rows
+            )
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for fixed directions.
@@ -86,11 +74,9 @@ class ThreadSolver:
         """
         springs = self.springs
         for colour in springs.first_colours:
-            arguments = (springs.on_device, self._pieces, colour, state.nodes, state.motion, dt, self._work)
-            if runs_on_gpu():
-                straighten_threads_in_blocks(*arguments, self._rows)
-            else:
-                straighten_threads(*arguments)
+            straighten_threads(
+                springs.on_device, self._pieces, colour, state.nodes, state.motion, dt, self._work, self._rows
+            )
 
     def excess(self, state: ClothState, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
@@ -116,75 +102,6 @@ def tension_to_turn(stress, weight):
     return excess
 
 
-@kernel
-def solve_threads(
-    springs: SpringArrays, pieces: Pieces, first: ti.i32, nodes: Nodes, dt: ti.f32, is_first: ti.i32, work: ThreadWork
-):
-    """Some colours, from `first` on; each piece exactly:
-
-        (w_s + w_s+1 + a) D_s - w_s n_s-1.n_s D_s-1 - w_s+1 n_s.n_s+1 D_s+1 = -C_s - a l_s,   a = 1/(k dt²)
-
-    Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
-    of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
-    """
-    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(pieces.spring_of_colour, first)
-    p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
-    for first_spring, end_spring, first_piece, end_piece in ti.static(
-        ((s0, s1, p0, p1), (s1, s2, p1, p2), (s2, s3, p2, p3), (s3, s4, p3, p4))
-    ):
-        for s in range(first_spring, end_spring):
-            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-            d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
-                nodes.displacement[i] - nodes.displacement[j]
-            )
-            length = ti.max(d.norm(), TINY_LENGTH)
-            compliance = 1.0 / (springs.law[s][1] * dt * dt)
-            if is_first:
-                work.multiplier[s] = 0.0
-            work.tension[s] = 1.0 / length
-            at_start = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
-            work.direction[s] = direction_of(at_start, d / length)
-            work.change[s] = springs.law[s][0] - springs.shift[s] - length - compliance * work.multiplier[s]
-            work.lower[s] = -nodes.inverse_mass[i]
-            work.diagonal[s] = nodes.inverse_mass[i] + nodes.inverse_mass[j] + compliance
-        for p in range(first_piece, end_piece):
-            start, stop = pieces.segment_start[p], pieces.segment_start[p + 1]
-            inverse_pivot = 0.0
-            solved = 0.0
-            n_before = ti.math.vec3(0.0)
-            for s in range(start, stop):
-                n_s = work.direction[s]
-                coupling = work.lower[s] * n_before.dot(n_s)
-                factor = coupling * inverse_pivot
-                inverse_pivot = 1.0 / (work.diagonal[s] - coupling * factor)
-                solved = (work.change[s] - coupling * solved) * inverse_pivot
-                work.lower[s] = factor
-                work.change[s] = solved
-                n_before = n_s
-            factor = 0.0
-            for m in range(stop - start):
-                s = stop - 1 - m
-                solved = work.change[s] - factor * solved
-                work.change[s] = solved
-                factor = work.lower[s]
-            pieces.is_taut[p] = 0
-        for s in range(first_spring, end_spring):
-            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-            push = work.change[s] * work.direction[s]
-            moved = -push  # of the node that the spring leads to, which the next one leads from
-            if s + 1 < pieces.piece.shape[0] and pieces.piece[s + 1] == pieces.piece[s]:
-                moved += work.change[s + 1] * work.direction[s + 1]
-            nodes.displacement[j] = nodes.displacement[j] + nodes.inverse_mass[j] * moved
-            if s == 0 or pieces.piece[s - 1] != pieces.piece[s]:
-                nodes.displacement[i] = nodes.displacement[i] + nodes.inverse_mass[i] * push
-            work.multiplier[s] = work.multiplier[s] + work.change[s]
-            weight = nodes.inverse_mass[i] + nodes.inverse_mass[j]
-            work.tension[s] = tension_to_turn(-work.multiplier[s] * work.tension[s], weight)
-            if work.tension[s] > 0.0:
-                pieces.is_taut[pieces.piece[s]] = 1
-
-
 @func
 def corrected(i: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32) -> ti.math.vec3:
     """By how much springs have changed the displacement of a node so far; by nothing if it is pinned."""
@@ -192,60 +109,6 @@ def corrected(i: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32) -> ti.mat
     if nodes.inverse_mass[i] > 0.0:
         change = nodes.displacement[i] - (motion.carry[i] + dt * motion.velocity[i])
     return change
-
-
-@kernel
-def straighten_threads(
-    springs: SpringArrays, pieces: Pieces, first: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32, work: ThreadWork
-):
-    """Solve (1 + w_i (t_i-1 + t_i)) e_i - w_i t_i-1 e_i-1 - w_i t_i e_i+1 = e~_i in each taut piece of some colours.
-
-    e~ is by how much springs have changed the displacements, e by how much they shall have; t_i is the tension of the
-    spring from node i on. What is stored for a spring is of the node that it leads to.
-    """
-    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(pieces.spring_of_colour, first)
-    p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
-    for first_spring, end_spring, first_piece, end_piece in ti.static(
-        ((s0, s1, p0, p1), (s1, s2, p1, p2), (s2, s3, p2, p3), (s3, s4, p3, p4))
-    ):
-        for s in range(first_spring, end_spring):
-            if pieces.is_taut[pieces.piece[s]]:
-                j = springs.nodes[2 * s + 1]
-                work.diagonal[s] = nodes.inverse_mass[j]
-                work.solved[s] = corrected(j, nodes, motion, dt)
-        for p in range(first_piece, end_piece):
-            if pieces.is_taut[p]:
-                start, stop = pieces.segment_start[p], pieces.segment_start[p + 1]
-                head = springs.nodes[2 * start]
-                change = corrected(head, nodes, motion, dt)
-                t_after = work.tension[start]
-                pull = nodes.inverse_mass[head] * t_after
-                e_head = change / (1.0 + pull)
-                share_of_head = pull / (1.0 + pull)
-                e_i = e_head
-                share = share_of_head  # of the next node in this one
-                for s in range(start, stop):
-                    pull = work.diagonal[s] * t_after
-                    t_after = 0.0
-                    if s + 1 < stop:
-                        t_after = work.tension[s + 1]
-                    onward = work.diagonal[s] * t_after
-                    pivot = 1.0 / (1.0 + onward + pull * (1.0 - share))
-                    e_i = pivot * (work.solved[s] + pull * e_i)
-                    share = pivot * onward
-                    work.lower[s] = share
-                    work.solved[s] = e_i
-                for m in range(1, stop - start):
-                    s = stop - 1 - m
-                    e_i = work.solved[s] + work.lower[s] * e_i
-                    work.solved[s] = e_i
-                nodes.displacement[head] = nodes.displacement[head] + (e_head + share_of_head * e_i - change)
-        for s in range(first_spring, end_spring):
-            if pieces.is_taut[pieces.piece[s]]:
-                j = springs.nodes[2 * s + 1]
-                change_j = work.solved[s] - corrected(j, nodes, motion, dt)
-                nodes.displacement[j] = nodes.displacement[j] + change_j
 
 
 @ti.func
@@ -279,7 +142,7 @@ def reduced_row(j, rows: ti.template(), lower, diagonal, upper, right, shared: t
 
 
 @kernel
-def solve_threads_in_blocks(
+def solve_threads(
     springs: SpringArrays,
     pieces: Pieces,
     first: ti.i32,
@@ -289,7 +152,13 @@ def solve_threads_in_blocks(
     work: ThreadWork,
     rows: ti.template(),
 ):
-    """What `solve_threads` does, with `rows` threads of a GPU for each piece."""
+    """Some colours, from `first` on, with `rows` threads of a GPU for each piece, and each piece exactly:
+
+        (w_s + w_s+1 + a) D_s - w_s n_s-1.n_s D_s-1 - w_s+1 n_s.n_s+1 D_s+1 = -C_s - a l_s,   a = 1/(k dt²)
+
+    Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
+    of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
+    """
     p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
     for first_piece, end_piece in ti.static(((p0, p1), (p1, p2), (p2, p3), (p3, p4))):
         ti.loop_config(block_dim=rows)
@@ -343,7 +212,7 @@ def solve_threads_in_blocks(
 
 
 @kernel
-def straighten_threads_in_blocks(
+def straighten_threads(
     springs: SpringArrays,
     pieces: Pieces,
     first: ti.i32,
@@ -353,7 +222,12 @@ def straighten_threads_in_blocks(
     work: ThreadWork,
     rows: ti.template(),
 ):
-    """What `straighten_threads` does, with `rows` threads of a GPU for each piece: one for each of its nodes."""
+    """Solve (1 + w_i (t_i-1 + t_i)) e_i - w_i t_i-1 e_i-1 - w_i t_i e_i+1 = e~_i in each taut piece of some colours,
+    with `rows` threads of a GPU for each, one for each of its nodes.
+
+    e~ is by how much springs have changed the displacements, e by how much they shall have; t_i is the tension of the
+    spring from node i on.
+    """
     p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
     for first_piece, end_piece in ti.static(((p0, p1), (p1, p2), (p2, p3), (p3, p4))):
         ti.loop_config(block_dim=rows)

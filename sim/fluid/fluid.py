@@ -16,11 +16,12 @@ from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
 from sim.fluid.kernels import Discretization
 from sim.fluid.opening import openings_of
+from sim.fluid.parameters import is_implicit
 from sim.fluid.particles import Phases
 from sim.fluid.stepping import SolveRecord
 from sim.fluid.surface_tension import Cohesion
 from sim.fluid.tank import FluidStart, ParticleTank
-from sim.fluid.viscosity import CARRIED, LAPLACIAN_FACTOR, is_implicit
+from sim.fluid.viscosity import CARRIED, LAPLACIAN_FACTOR
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
-from sim.fluid.traits import TRAITS
+from sim.fluid.traits import CFL_NUMBER, TRAITS, VISCOUS_NUMBER
 from sim.shapes.parameters import Placement
 
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
@@ -204,3 +204,15 @@ def shared_conflicts(fluids: Sequence[FluidParameters]) -> list[tuple[int, str, 
 
 def _written(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else "omitted" if value is None else f"{value:g}"
+
+
+def is_implicit(parameters: FluidParameters, viscosity: float, speed: float) -> bool:
+    """Whether viscosity is solved for: as the parameters say, or for "auto" where it would limit the time step.
+
+    `viscosity` is that of the stiffest fluid, against walls too [m²/s], and `speed` that of signals [m/s].
+    """
+    if parameters.viscosity_solver != "auto" or viscosity == 0.0:
+        return parameters.viscosity_solver == "implicit" and viscosity > 0.0
+    dt, spacing = parameters.dt, parameters.spacing
+    other = float(dt) if dt != "adaptive" else parameters.cfl * CFL_NUMBER * spacing / speed
+    return VISCOUS_NUMBER * spacing**2 / viscosity < other

@@ -12,10 +12,8 @@ from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
 from sim.fluid.body_friction import BodyFriction, Friction
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
-from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid, Particles, ParticleSet
 from sim.fluid.stepping import SolveRecord
-from sim.fluid.traits import CFL_NUMBER, VISCOUS_NUMBER
 
 LAPLACIAN_FACTOR = 10.0  # 2 (d + 2) of Monaghan's viscosity in d = 3 dimensions
 SOFTENING = 0.01  # keeps |x_ij|² + 0.01 h² away from zero for particles that meet
@@ -58,18 +56,6 @@ def pair_viscosity(mu_i: ti.f32, mu_j: ti.f32) -> ti.f32:
     Cleary & Monaghan 1999, "Conduction modelling using smoothed particle hydrodynamics", eq. 14, for viscosity.
     """
     return 2.0 * mu_i * mu_j / ti.max(mu_i + mu_j, 1.0e-30)
-
-
-def is_implicit(parameters: FluidParameters, viscosity: float, speed: float) -> bool:
-    """Whether viscosity is solved for: as the parameters say, or for "auto" where it would limit the time step.
-
-    `viscosity` is that of the stiffest fluid, against walls too [m²/s], and `speed` that of signals [m/s].
-    """
-    if parameters.viscosity_solver != "auto" or viscosity == 0.0:
-        return parameters.viscosity_solver == "implicit" and viscosity > 0.0
-    dt, spacing = parameters.dt, parameters.spacing
-    other = float(dt) if dt != "adaptive" else parameters.cfl * CFL_NUMBER * spacing / speed
-    return VISCOUS_NUMBER * spacing**2 / viscosity < other
 
 
 class ImplicitViscosity:

@@ -12,8 +12,8 @@ from pipeline.base.errors import PipelineError
 from pipeline.kinds.cloth import count_cloth_nodes
 from pipeline.kinds.live_parameters import Value
 from pipeline.kinds.table import KINDS
+from pipeline.kinds.work import cloth_frame_s, fewest_for_bodies, frame_s, steps_a_frame
 from pipeline.model.job import Job
-from pipeline.web.live.frame_cost import cloth_frame_s, fewest_for_bodies, frame_s, steps_a_frame
 from pipeline.web.live.parameters import parameters_of
 from sim.cloth.parameters import ClothParameters, substeps_of
 

@@ -26,6 +26,7 @@ OF_QUEUE = {"pause", "cancel", "priority"}
 
 WRITERS = {
     "submit": [["{file}", "--output", "{farm}"], ["{job}/job.toml"]],
+    "sweep": [["{file}", "--output", "{farm}", "--set", "frames=1,2"]],
     "rerun": [["{job}", "--failed"], ["{job}", "--stage", "render"]],
     "resume": [["{job}"]],
     "work": [["{job}", "--stage", "simulate"], ["{job}", "--stage", "render"]],
@@ -49,6 +50,7 @@ PICTURE = "frames/000000.png"
 LINKS = (
     *("frames", "cache", "cache/checkpoints", "logs", "stills", "inputs", "rejected", ".receipts", ".receipts/frames"),
     *(".provenance/jobs", ".so-far", "frames/000000.png", "job.toml", "manifest.db", "runner.lease", "report.html"),
+    "siblings.json",
 )
 
 

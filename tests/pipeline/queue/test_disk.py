@@ -6,28 +6,21 @@ from collections import namedtuple
 
 import click
 import pytest
-from record_samples import film
 
 from pipeline.cli.arguments import parse_age, parse_size
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 from pipeline.queue import disk
-from pipeline.record.reader import StageCost
-from pipeline.run.plan import assess
 
 SIZE = disk.Size(elements={"fluid": 1_000_000}, pixels=1920 * 1080)
 Usage = namedtuple("Usage", "total used free")
 
 
-def estimated(frames: int, costs: dict[str, StageCost]) -> float:
-    assessments = assess(film(frames), {}, {}, parameters=lambda _: None)
-    return disk.estimate_bytes(assessments, costs, SIZE)
-
-
-def test_an_estimate_grows_with_the_frames_that_are_to_be_made():
-    ten, twenty = estimated(10, {}), estimated(20, {})
-    # 26 bytes a particle and 1.2 a pixel; checkpoints and the film are there once.
-    assert twenty - ten == pytest.approx(10 * (22_000 + 26e6 + 1_000 + 1.2 * 1920 * 1080))
+def test_files_take_what_their_elements_and_pixels_take():
+    # 26 bytes a particle and 1.2 a pixel; two checkpoints are there once.
+    assert disk.bytes_per_artifact("simulate", SIZE) == pytest.approx(22_000 + 26e6)
+    assert disk.bytes_per_artifact("render", SIZE) == pytest.approx(1_000 + 1.2 * 1920 * 1080)
+    assert disk.checkpoint_bytes(SIZE) == pytest.approx(2 * 90e6)
 
 
 @pytest.mark.parametrize(
@@ -45,15 +38,6 @@ def test_masters_and_deep_pictures_count_with_what_they_take(render, bytes_per_p
     size = disk.size_of(job, Findings())
     assert size.picture_bytes_per_pixel == pytest.approx(bytes_per_pixel)
     assert size.film_factor == 30.0
-
-
-def test_what_the_stages_have_taken_counts_more_than_what_jobs_usually_take():
-    costs = {"render": StageCost("render", 1.0, 5e6), "simulate": StageCost("simulate", 1.0, 1e6)}
-    assert estimated(20, costs) - estimated(10, costs) == pytest.approx(10 * 6e6)
-
-
-def test_what_is_up_to_date_takes_nothing():
-    assert disk.estimate_bytes([], {}, SIZE) == 0.0
 
 
 def test_the_reserve_is_a_share_of_a_small_disk(tmp_path, monkeypatch):

@@ -13,14 +13,12 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task, TaskId, task_fingerprint
 from pipeline.model.job import Job
 from pipeline.record.manifest import artifact_row
-from pipeline.record.reader import ArtifactRow, StageCost
+from pipeline.record.reader import ArtifactRow
 from pipeline.record.reconcile import FileCondition, FileProblem
 from pipeline.run.plan import (
     Assessment,
-    Estimate,
     Verdict,
     assess,
-    estimate,
     frame_ranges,
     in_order,
     plan_job,
@@ -209,14 +207,6 @@ def test_whatever_is_damaged_all_that_depends_on_it_and_nothing_else_may_run(dat
 )
 def test_frames_are_named_in_ranges_over_the_frames_that_are_planned(frames, planned, text):
     assert frame_ranges(frames, planned) == text
-
-
-def test_an_estimate_goes_by_what_the_stage_has_taken_before():
-    assessments = assess_film(film(FRAMES), {}).values()
-    costs = {"render": StageCost("render", 2.5, 1000.0)}
-    assert estimate(assessments, costs) == [Estimate("render", 15.0, 6000.0)]
-    finished = film(FRAMES)
-    assert estimate(assess_film(finished, rows_of(finished)).values(), costs) == []
 
 
 @settings(deadline=None)

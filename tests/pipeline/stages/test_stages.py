@@ -14,9 +14,9 @@ from blender_scripts.look_table import LOOK_TABLE
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import Resources
+from pipeline.model.gpus import GPU_TASKS
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
-from pipeline.queue.turns import GPU_TASKS
 from pipeline.run.events import Start
 from pipeline.run.plan import plan_job
 from pipeline.run.scheduler import Scheduler

@@ -306,6 +306,21 @@ def test_a_cloth_that_flies_past_makes_no_more_substeps_for_all():
     assert substeps <= expected + 12
 
 
+def test_steps_follow_the_nodes_that_are_near_a_body():
+    """A corner at 40 m/s, 0.8 m from a plate of 4 mm: steps were as short as for one beside it."""
+    plate = {"shape": {"type": "box", "size": (0.05, 0.05, 0.004)}, "position": (-0.3, -0.3, 0.197)}
+    sheet = {"shape": rectangle((0.6, 0.6), (13, 13)), "position": (0.0, 0.0, 0.2), "self_collision": False}
+    far, near = (world_of(sheet, bodies=[plate]) for _ in range(2))
+    steps = []
+    for world, node in ((far, -1), (near, 0)):
+        velocity = np.zeros((169, 3))
+        velocity[node] = (0.0, 0.0, 40.0)
+        cloth_of(world).state.velocity.from_numpy(velocity.astype(np.float32))
+        steps.append(cloth_of(world).stable_dt())
+    assert steps[0] == pytest.approx(1.0 / (FRAMES_PER_SECOND * 20))
+    assert steps[1] == pytest.approx(0.125 * 0.004 / 40.0, rel=1e-3)
+
+
 def test_a_pinned_sheet_catches_a_heavy_ball():
     corners = [{"corner": corner} for corner in ("x-y-", "x+y-", "x-y+", "x+y+")]
     sheet = {
@@ -374,13 +389,10 @@ def test_a_pellet_does_not_pass_between_nodes_at_150_m_per_s():
         now = places()
         passed.append(passes(before[0], now))
         before[0] = now
-        if len(passed) == 200:
-            raise InterruptedError  # in the middle of a frame of 1,700 substeps
 
     world.watch, before = watch, [places()]
     momentum, _ = momenta(world)
-    with pytest.raises(InterruptedError):
-        world.advance_frame()
+    world.advance_frame()
     bodies = rigid_of(world).bodies
     assert sum(passed) == 0
     assert bodies.position[0, 2] < -0.08

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import thread_reference
 from cloth_scenes import advance, cloth, rectangle, solver_of
 
+from sim.cloth import threads
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.solver import ClothSolver
 
@@ -17,7 +19,9 @@ def only_on_a_cpu(taichi_cpu):
 
 
 def by_lists(monkeypatch, *cloths: ClothParameters) -> ClothSolver:
-    """A solver that takes rectangles for meshes."""
+    """A solver that takes rectangles for meshes, as on a GPU, with threads in float64."""
+    for solve in (thread_reference.solve_threads, thread_reference.straighten_threads):
+        monkeypatch.setattr(threads, solve.__name__, solve)
     with monkeypatch.context() as patch:
         for module in ("sim.cloth.solver", "sim.cloth.xpbd"):
             patch.setattr(f"{module}.rectangles_in_rows", lambda _host: {})

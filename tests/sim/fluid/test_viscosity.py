@@ -6,8 +6,8 @@ from scipy.special import jv
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.core.domain import DomainParameters
-from sim.fluid.parameters import FluidParameters
-from sim.fluid.viscosity import TOLERANCE, is_implicit
+from sim.fluid.parameters import FluidParameters, is_implicit
+from sim.fluid.viscosity import TOLERANCE
 
 OPEN_SPACE = DomainParameters(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5), open_faces=EVERY_FACE)
 SPACING = 0.02

@@ -8,6 +8,7 @@ from places import PROJECT
 from pipeline.base.errors import PipelineError
 from pipeline.job.loading import load_job
 from pipeline.job.starter import write_starter
+from pipeline.kinds.work import cloth_frame_s, fewest_for_bodies, fluid_frame_s, steps_a_frame
 from pipeline.web.live.admission import (
     FEWEST_SUBSTEPS,
     FLUENT_FRAME_S,
@@ -17,7 +18,6 @@ from pipeline.web.live.admission import (
     require_small,
     told_changes,
 )
-from pipeline.web.live.frame_cost import cloth_frame_s, fewest_for_bodies, fluid_frame_s, steps_a_frame
 from pipeline.web.live.parameters import parameters_of
 from pipeline.web.live.saving import save_job
 
