@@ -142,7 +142,7 @@ def test_cloth_outside_of_the_box_is_in_its_own_wind_and_takes_it_up_again_when_
 
 def test_cloths_in_one_air_cannot_take_two_densities_of_it_live(gusty_room):
     cloth = gusty_room.cloth
-    with pytest.raises(ValueError, match=r'air_density of cloth "layer3" is 0\.6 kg/m³, but that of "layer0" 1\.2'):
+    with pytest.raises(ValueError, match=r'is 0\.6 kg/m³ for "layer3", but 1\.2 kg/m³ for "layer0"'):
         cloth.change("layer3", air_density=0.6)
     with pytest.raises(ValueError, match=r"beside smoke it must be 0, or 0\.001 kg/m³ at least"):
         cloth.change("layer3", air_density=1.0e-4)
