@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from pipeline.base.errors import JobFileError, PipelineError, PlanError
 from pipeline.base.layout import JobLayout
@@ -61,6 +62,18 @@ class JobFilePath(click.ParamType):  # type: ignore[type-arg]
         output = DEFAULT_OUTPUT if ctx is None else ctx.params.get("output", DEFAULT_OUTPUT)
         return value if isinstance(value, Path) else find_job_file(value, output)
 
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """Names of submitted jobs, and files."""
+        return [*complete_jobs(ctx, param, incomplete), CompletionItem(incomplete, type="file")]
+
+
+def complete_jobs(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Names of the jobs in the output folder, for the shell."""
+    output = ctx.params.get("output") or DEFAULT_OUTPUT
+    folders = sorted(output.iterdir()) if output.is_dir() else []
+    jobs = [folder.name for folder in folders if JobLayout(folder).manifest.exists()]
+    return [CompletionItem(job) for job in jobs if job.startswith(incomplete)]
+
 
 def job_options(command: Any) -> Any:
     """The job file and the options that change the job."""
@@ -87,7 +100,7 @@ def claim_cores(cores: int | None) -> Resources:
 
 def submitted_job_argument(command: Any) -> Any:
     """A job that was submitted before: its name, its job file, or its folder."""
-    return output_option(click.argument("job", metavar="JOB")(command))
+    return output_option(click.argument("job", metavar="JOB", shell_complete=complete_jobs)(command))
 
 
 def target_option(meaning: str, *, required: bool = False) -> Callable[[Any], Any]:

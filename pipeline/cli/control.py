@@ -17,6 +17,7 @@ from pipeline.base.signals import signals_to
 from pipeline.cli.arguments import (
     PRIORITY,
     claim_cores,
+    complete_jobs,
     find_job,
     output_option,
     parse_frames,
@@ -111,7 +112,7 @@ def cancel(job: str, output: Path) -> None:
 
 @click.command(context_settings={"ignore_unknown_options": True})  # -5 is a priority
 @output_option
-@click.argument("job", metavar="JOB")
+@click.argument("job", metavar="JOB", shell_complete=complete_jobs)
 @click.argument("value", metavar="PRIORITY", type=PRIORITY)
 def priority(job: str, output: Path, value: int) -> None:
     """Let a job of the queue go before or after others.
@@ -131,7 +132,7 @@ def priority(job: str, output: Path, value: int) -> None:
 
 @click.command()
 @output_option
-@click.argument("job", metavar="[JOB]", required=False)
+@click.argument("job", metavar="[JOB]", required=False, shell_complete=complete_jobs)
 @click.option(
     "--stage", help="Run this stage of JOB in this process, for a farm manager: no queue, no record, no retry."
 )

@@ -21,6 +21,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import TaskId
 from pipeline.base.wording import print_warnings
 from pipeline.cli.arguments import (
+    complete_jobs,
     find_job,
     job_folder,
     json_option,
@@ -47,7 +48,7 @@ _VERDICT_WORDING = {
 
 
 @click.command()
-@click.argument("job", metavar="[JOB]", required=False)
+@click.argument("job", metavar="[JOB]", required=False, shell_complete=complete_jobs)
 @output_option
 @json_option
 @click.option(

@@ -17,6 +17,7 @@ from pipeline.base.errors import PipelineError, StageUnavailableError
 from pipeline.base.layout import JobLayout
 from pipeline.cli.arguments import (
     claim_cores,
+    complete_jobs,
     cores_option,
     find_job,
     output_option,
@@ -260,7 +261,7 @@ def _fitted(resolution: tuple[int, int], width: int) -> tuple[int, int]:
 
 
 @click.command()
-@click.argument("jobs", metavar="JOB...", nargs=-1, required=True)
+@click.argument("jobs", metavar="JOB...", nargs=-1, required=True, shell_complete=complete_jobs)
 @output_option
 @target_option("; JOB/report.html if omitted, which several jobs cannot")
 def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
@@ -287,7 +288,7 @@ def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
 
 
 @click.command()
-@click.argument("jobs", metavar="JOB JOB...", nargs=-1, required=True)
+@click.argument("jobs", metavar="JOB JOB...", nargs=-1, required=True, shell_complete=complete_jobs)
 @output_option
 @click.option("--width", type=click.IntRange(128, 7680), default=1920, show_default=True, help="Most pixels across.")
 @target_option(": an MP4", required=True)

@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.shell_completion import ShellComplete
 from command_line import pipeline
 from places import PROJECT
 
+from pipeline.base.layout import JobLayout
 from pipeline.cli.main import main
 from pipeline.cli.make import TEMPLATES
 from pipeline.job import starter
@@ -144,3 +146,14 @@ def test_a_job_file_may_not_name_the_program_to_run(in_tmp_path, monkeypatch):
     assert "render.blender names a program" not in pipeline("check", "film.toml").stderr
     monkeypatch.delenv("PIPELINE_BLENDER")
     assert "names a program" not in pipeline("check", "film.toml", "--set", f"render.blender={program}").stderr
+
+
+@pytest.mark.parametrize("command", ["submit", "status"])
+def test_the_shell_completes_names_of_jobs(command, tmp_path):
+    for name in ("drop-a", "drop-b", "dam"):
+        JobLayout(tmp_path / name).root.mkdir()
+        JobLayout(tmp_path / name).manifest.touch()
+    (tmp_path / "drop-c").mkdir()  # no job
+    arguments = [command, "--output", str(tmp_path)]
+    found = ShellComplete(main, {}, "pipeline", "").get_completions(arguments, "drop")
+    assert [each.value for each in found if each.type == "plain"] == ["drop-a", "drop-b"]
