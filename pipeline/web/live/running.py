@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 SHOWN_EVERY_S = 1.0 / 30.0
 """Least time between two pictures of a page, on average."""
 TOLD_EVERY_S = 0.2
+BUILDING = "**The scene is being built: some seconds, the first time on a machine up to a minute.**"
 LONGEST_WAIT_S = 0.05
 """Longest wait for requests and the end, while time stands still or is slow."""
 
@@ -61,6 +62,8 @@ def show_live(
     from sim.shapes.solid import ShapeError
 
     with _memory_told(job), page_server(host=host, port=port, label=job.name) as server:
+        say(f"{address(server)} runs {job.name}; Ctrl-C ends it")
+        waiting = in_its_loop(server, server.gui.add_markdown, BUILDING)
         from pipeline.web.live.page import LivePage
 
         try:
@@ -73,8 +76,8 @@ def show_live(
             raise PipelineError(f"{job.name}: {error}") from error
         session.is_paused = paused
         recorder = Recorder(loaded, session, output, device=device)
+        in_its_loop(server, waiting.remove)
         page = in_its_loop(server, LivePage, server, session, recorder, folder)
-        say(f"{address(server)} runs {job.name}; Ctrl-C ends it")
         try:
             with _memory_told(job):
                 run(session, page, ends=ends)

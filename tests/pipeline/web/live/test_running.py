@@ -4,6 +4,7 @@ import math
 import threading
 
 import pytest
+import viser
 from live_jobs import BALL_OVER_SHEET, live, served
 from page_threads import threads_that_push
 
@@ -35,6 +36,23 @@ def test_live_ends_with_a_line_where_no_memory_is_left(tmp_path, monkeypatch, wh
     assert ended.exit_code == 1
     told = f"error: drape cannot go on, as no memory is left: {type(error).__name__}: {error}"
     assert told in ended.output.splitlines()
+
+
+def test_the_address_is_there_and_the_page_says_what_it_waits_for_while_the_scene_is_built(tmp_path, monkeypatch):
+    shown = []
+
+    def builds(*_arguments: object, **_options: object) -> None:
+        shown.extend(markdown.content for markdown in texts)
+        raise MemoryError("as a test ends here")
+
+    texts = []
+    add = viser.GuiApi.add_markdown
+    monkeypatch.setattr(
+        viser.GuiApi, "add_markdown", lambda *given, **how: texts.append(add(*given, **how)) or texts[-1]
+    )
+    monkeypatch.setattr(running, "Session", builds)
+    assert "runs drape; Ctrl-C ends it" in live(tmp_path).output
+    assert shown == [running.BUILDING]
 
 
 def test_errors_of_the_program_keep_their_traceback(tmp_path, monkeypatch):
