@@ -24,7 +24,7 @@ from pipeline.store.receipts import read_receipt
 from pipeline.web.auth import REPORT_POLICY, Access, Gate, form_of
 from pipeline.web.dashboard.actions import Queue, actions_of
 from pipeline.web.dashboard.farm_view import FarmView, JobCard, Kept
-from pipeline.web.dashboard.job_view import STATE_GROUPS, Question, film_of, look_at_job
+from pipeline.web.dashboard.job_view import LONGEST_TEXT, STATE_GROUPS, Question, film_of, look_at_job
 from pipeline.web.dashboard.machine import Machine
 from pipeline.web.dashboard.pages import FARM_PARTS, JOB_PARTS, Pages, Part, job_url
 from pipeline.web.dashboard.places import NotThereError, Places, printable
@@ -77,7 +77,7 @@ class Dashboard:
     # --- pages ---
     def farm_page(self, request: Request) -> Response:
         """All jobs."""
-        return self._page(request, "farm.html", self._farm(request))
+        return self._page(request, "farm.html", self._farm(request), find=_asked_name(request))
 
     def farm_parts(self, request: Request) -> Response:
         """Parts of that page that have changed."""
@@ -99,14 +99,17 @@ class Dashboard:
         return HTMLResponse(self.pages.draw(template, parts=parts, **self._common(request), **context))
 
     def _farm(self, request: Request) -> dict[str, Part]:
-        glance = self.view.glance()
-        show_all = "all" in request.query_params
+        glance, find = self.view.glance(), _asked_name(request)
+        show_all = "all" in request.query_params or bool(find)
         has_runner = glance.runner is not None or self.queue.is_starting
         settled = [job for job in glance.jobs if job.state in (JobState.DONE, JobState.UNKNOWN) and job.entry is None]
         hidden = set() if show_all else {job.name for job in settled[SETTLED_SHOWN:]}
         return self.pages.parts(
             FARM_PARTS,
-            groups=_grouped([job for job in glance.jobs if job.name not in hidden]),
+            groups=_grouped(
+                [job for job in glance.jobs if job.name not in hidden and find.casefold() in job.name.casefold()]
+            ),
+            find=find,
             hidden=len(hidden),
             actions={job.name: actions_of(job, has_runner=has_runner) for job in glance.jobs},
             flaws=glance.flaws,
@@ -238,6 +241,11 @@ class Dashboard:
         if isinstance(error, OSError):
             return self._message(request, 503, f"the farm's disk: {error.strerror or error}")
         return self._message(request, 404 if isinstance(error, NotThereError) else 409, str(error))
+
+
+def _asked_name(request: Request) -> str:
+    """The part of a job's name that is looked for; "" for none."""
+    return request.query_params.get("find", "").strip()[:LONGEST_TEXT]
 
 
 def _grouped(jobs: list[JobCard]) -> list[tuple[str, list[JobCard]]]:

@@ -104,7 +104,7 @@ function filter(form) {
   const asked = new URLSearchParams([...new FormData(form)].filter(([, value]) => value));
   const address = new URL(location.href);
   address.search = asked;
-  address.hash = "tasks";
+  address.hash = form.dataset.filter;
   history.replaceState(null, "", address);
   refresh();
 }

@@ -69,6 +69,20 @@ def test_every_job_is_shown_with_its_state_tasks_reasons_and_logs(farm: Farm) ->
         assert "ValueError" in story.partition('class="log"')[2]
 
 
+def test_jobs_are_found_by_a_part_of_their_name(farm: Farm) -> None:
+    for name in ("drop-thin", "drop-thick", "dam"):
+        queued_job(farm, name)
+    with dashboard(farm) as (client, _):
+        for question, found in (("DROP", {"drop-thin", "drop-thick"}), ("thick", {"drop-thick"}), ("", {"dam"})):
+            listed = client.ask(f"/?find={question}").text
+            assert all(f'data-key="{name}"' in listed for name in found)
+        assert 'data-key="dam"' not in client.ask("/?find=drop").text
+        nothing = client.ask("/?find=%3Cb%3Educk").text
+        assert "&lt;b&gt;duck" in nothing
+        assert "<b>duck" not in nothing
+        assert client.ask("/parts?find=thick").text.count("data-key=") == 2  # the job, and its group
+
+
 def test_tasks_come_by_the_page(farm: Farm) -> None:
     frame_job(farm.layout("long"), 10_000)
     with dashboard(farm) as (client, _):
