@@ -183,7 +183,10 @@ class Scene:
         solver = self.world.solvers[solver_name]
         for name, body, force in self._forces:
             if name == solver_name and isinstance(solver, TakesPushes):
-                solver.push(body, dt * np.asarray(force(self.view(body), self.time_s), dtype=np.float64))
+                pushed = np.asarray(force(self.view(body), self.time_s), dtype=np.float64)
+                if not np.isfinite(pushed).all():
+                    raise ValueError(f'the force on "{body}" at {self.time_s:g} s is not finite')
+                solver.push(body, dt * pushed)
 
 
 @dataclass(frozen=True)
@@ -249,5 +252,7 @@ def submit(
     """
     layout = JobLayout(Path(output).absolute() / job.job.name)
     with redirect_stdout(sys.stderr):
-        submit_to_queue(job, layout, options=QueueOptions(detach=True, cores=cores), until=tuple(until))
+        code = submit_to_queue(job, layout, options=QueueOptions(detach=True, cores=cores), until=tuple(until))
+    if code != 0:
+        raise PipelineError(f"{layout.root} could not be queued; see: pipeline status {layout.root}")
     return Submission(job, layout.root)

@@ -33,7 +33,7 @@ def replace_durably(path: Path, content: str | bytes, *, mark: str = "part") -> 
 def replacing(path: Path) -> Iterator[Path]:
     """A path beside this one, of the same suffix, to write to; takes its place when the block ends without an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    part = path.with_name(f".{path.stem}.part.{uuid4().int}{path.suffix}")
     try:
         yield part
         part.replace(path)

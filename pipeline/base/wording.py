@@ -24,6 +24,8 @@ def duration(seconds: float) -> str:
 
 def rough_duration(seconds: float) -> str:
     """A time span that is an estimate, to a figure or two: `40 s`, `9 min`, `4 h`, `12 days`."""
+    if seconds > 100 * 365.0 * 86400.0:
+        return "more than a century"
     for unit, length, least in (("days", 86400.0, 2.0), ("h", 3600.0, 1.8), ("min", 60.0, 1.5)):
         if seconds >= least * length:
             number = seconds / length

@@ -88,6 +88,8 @@ def export(
     chosen = "" if frames is None else f":{frames}"
     if frames is not None:
         parse_frames(frames)
+    if target is not None and any(each.exists() and not each.is_dir() for each in (target, *target.parents)):
+        raise click.BadParameter(f"{target} is not a folder, or lies in what is none", param_hint="-o")
     _export(
         job_file,
         overrides,
@@ -112,14 +114,18 @@ def _export(
     from pipeline.job.loading import load_job
     from pipeline.queue.job_queue import Desired, JobQueue
     from pipeline.run.checked_job import read_own_job
-    from pipeline.show.handing_over import copy_export, refuse_if_busy, survey_export
+    from pipeline.run.goal import read_goal, write_goal
+    from pipeline.show.handing_over import PREFIX, copy_export, refuse_if_busy, survey_export
     from pipeline.stages import STAGES
 
     loaded = read_own_job(job_file, overrides, preview=preview, until=(end,))
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     waiting = JobQueue.of(layout).find(layout.root.absolute().name)
     refuse_if_busy(layout, None if waiting is None or waiting.desired is Desired.NONE else waiting.until)
+    before = tuple(goal for goal in read_goal(layout) if not goal.startswith(PREFIX))
     code = submit_to_queue(loaded, layout, options=options, until=(end,))
+    if code == 0 and not options.detach:
+        write_goal(layout, before)  # what is asked of the job later is about its film again
     if code or options.detach:
         if target is not None and not code:
             click.echo("what runs in the background is not copied; call again with -o when it is done", err=True)
@@ -129,7 +135,8 @@ def _export(
     if target is not None:
         copied = copy_export(found, layout, target)
         place = target
-        click.echo(f"{copied} of {len(found.files)} files copied into {target}; the others were there", err=True)
+        others = "" if copied == len(found.files) else "; the others were there"
+        click.echo(f"{copied} of {len(found.files)} files copied into {target}{others}", err=True)
     told = found.stage.opened_by.format(file=place / found.root)
     click.echo(f"{place / found.root}: {found.told}, {wording.size(found.bytes)} in {len(found.files)} files")
     click.echo(f"  {told}")

@@ -87,7 +87,7 @@ def sweep(
     if options.detach:
         say_aside("for the sheet and the table, give the same command again without --detach")
         sys.exit(code)
-    _write_results(planned, output, _sweep_name(planned, job_file))
+    _write_results(planned, output, _sweep_name(job_file, preview=preview))
     sys.exit(code)
 
 
@@ -191,8 +191,8 @@ def _write_results(planned: list[_Planned], output: Path, name: str) -> None:
         click.echo(f"{table}: {wording.counted(lines, 'line')}")
 
 
-def _sweep_name(planned: list[_Planned], job_file: Path) -> str:
+def _sweep_name(job_file: Path, *, preview: bool) -> str:
     """Of its sheet and its table."""
     from pipeline.job.loading import load_job
 
-    return load_job(job_file).name + ("-preview" if planned[0].loaded.job.name.endswith("-preview") else "")
+    return load_job(job_file).name + ("-preview" if preview else "")

@@ -26,10 +26,8 @@ BLENDER_VARIABLE = "PIPELINE_BLENDER"
 
 def needs_pictures(until: Sequence[str]) -> bool:
     """Whether a job that ends after these stages draws anything; one that is named wrongly counts as if it did."""
-    until = [each.partition(":")[0] for each in until]
-    names = [stage.name for stage in STAGES]
-    drawing = names.index(RenderStage.name) if RenderStage.name in names else len(names)
-    return not until or any(name not in names or names.index(name) >= drawing for name in until)
+    draws = {stage.name: stage.draws for stage in STAGES}
+    return not until or any(draws.get(each.partition(":")[0], True) for each in until)
 
 
 def without_pictures(findings: Findings) -> Findings:

@@ -101,13 +101,11 @@ def _blend(old: float, measured: float, weight: float) -> float:
 
 def known_rates() -> MachineRates | None:
     """The rates of this machine as they were kept; None if it was never measured."""
-    kept = _kept().get(_machine())
-    if kept is None:
-        return None
     try:
+        kept = json.loads(rates_file().read_text(encoding="utf-8"))
         learnt = {str(name): Factors(*each) for name, each in kept["learnt"].items()}
         rates = MachineRates(float(kept["one_core"]), float(kept["all_cores"]), int(kept["cores"]), learnt)
-    except (KeyError, TypeError, ValueError, AttributeError):
+    except (OSError, KeyError, TypeError, ValueError, AttributeError):
         return None
     return rates if rates.one_core > 0.0 and rates.all_cores > 0.0 and rates.cores > 0 else None
 
@@ -124,20 +122,12 @@ def measure() -> MachineRates:
 def keep(rates: MachineRates) -> None:
     """Keep the rates of this machine; a cache folder that cannot be written costs the next command a measurement."""
     with suppress(OSError), replacing(rates_file()) as part:
-        part.write_text(json.dumps({**_kept(), _machine(): asdict(rates)}, indent=1), encoding="utf-8")
+        part.write_text(json.dumps(asdict(rates), indent=1), encoding="utf-8")
 
 
 def rates_file() -> Path:
-    """Where rates are kept."""
-    return cache_folder() / "rates.json"
-
-
-def _kept() -> dict[str, Any]:
-    try:
-        kept = json.loads(rates_file().read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return kept if isinstance(kept, dict) else {}
+    """Where the rates of this machine are kept: a file a machine, as home folders may be shared."""
+    return cache_folder() / "rates" / f"{_machine()}.json"
 
 
 def _machine() -> str:

@@ -11,6 +11,7 @@ import re
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
+from pipeline.base.errors import StaleAttemptError
 from pipeline.base.files import replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import digest_of
@@ -45,7 +46,7 @@ def read_siblings(layout: JobLayout) -> list[JobLayout]:
     """The other jobs of its study that are there; none of a file that is none."""
     try:
         names = json.loads(layout.siblings.read_text(encoding="utf-8"))["jobs"]
-    except (FileNotFoundError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return []
     own = layout.root.absolute()
     named = [str(name) for name in names if _NAME.fullmatch(str(name))] if isinstance(names, list) else []
@@ -69,8 +70,11 @@ def take_over_shared(layout: JobLayout, tasks: Sequence[Task]) -> Shared:
             sibling, receipts = next(((each, theirs) for each, theirs in found if theirs is not None), (None, None))
             if sibling is None or receipts is None:
                 continue
-            for receipt in receipts:
-                take_over(layout, receipt, sibling)
+            try:
+                for receipt in receipts:
+                    take_over(layout, receipt, sibling)
+            except (FileNotFoundError, StaleAttemptError):
+                continue  # the other job has removed it or made it anew meanwhile, or this one newer: it is made here
             files += len(receipts)
             owners[sibling.root.name] = None
         hashes.update({receipt.artifact: receipt.hash for receipt in receipts})

@@ -56,16 +56,22 @@ def survey_export(job: Job, layout: JobLayout, stages: Sequence[Stage], end: str
 
 
 def copy_export(export: Export, layout: JobLayout, target: Path) -> int:
-    """Copy an export into a folder, complete in itself; returns how many files were not there already."""
+    """Copy an export into a folder, complete in itself; returns how many files were not there already.
+
+    Raises PipelineError: the folder cannot be written to.
+    """
     copied = 0
     for artifact in export.files:
         source, copy = layout.path(artifact), target / artifact
         status = source.stat()
-        if copy.is_file() and (copy.stat().st_size, copy.stat().st_mtime_ns) == (status.st_size, status.st_mtime_ns):
-            continue
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(copy) as part:
-            shutil.copy2(source, part)
+        try:
+            there = copy.stat() if copy.is_file() else None
+            if there is not None and (there.st_size, there.st_mtime_ns) == (status.st_size, status.st_mtime_ns):
+                continue
+            with replacing(copy) as part:
+                shutil.copy2(source, part)
+        except OSError as error:
+            raise PipelineError(f"{copy} cannot be written: {error.strerror}") from error
         copied += 1
     return copied
 

@@ -68,6 +68,7 @@ class Stage(Protocol):
     name: str
     version: int  # raised when the same parameters and inputs give other outputs; part of the fingerprint
     about: str = ""  # what it makes, in a few words for people
+    draws: bool = False  # whether it needs what the job says about pictures: camera, looks, lights
     on_demand: bool = False  # whether it is no part of the film, and planned only for who asks for it
 
     @abstractmethod

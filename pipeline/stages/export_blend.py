@@ -31,6 +31,7 @@ class _SceneExport(ExportStage):
     """One file of all frames, written by Blender."""
 
     of_one_range = True
+    draws = True
 
     def preflight(self, job: Job) -> list[str]:
         """What drawing needs, too."""

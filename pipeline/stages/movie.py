@@ -24,6 +24,7 @@ class MovieStage(Stage):
 
     name = "movie"
     about = "the film"
+    draws = True
     version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

@@ -68,6 +68,7 @@ class RenderStage(Stage):
 
     name = "render"
     about = "pictures"
+    draws = True
     version = 4
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:

@@ -187,6 +187,8 @@ def take_over(layout: JobLayout, receipt: Receipt, owner: JobLayout) -> None:
         shutil.copy2(source, part)
         sync(part)
     try:
+        if (status := part.stat()).st_size != receipt.size or status.st_mtime_ns != receipt.mtime_ns:
+            raise FileNotFoundError(errno.ENOENT, "was made anew while it was taken over", str(source))
         with _lock(receipt_path.with_name(_LOCK_NAME)):
             _fence(layout, receipt)
             _invalidate(layout, receipt.artifact)

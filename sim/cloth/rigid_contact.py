@@ -1,5 +1,6 @@
 """Cloth against rigid bodies and walls: what touches in a substep."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -203,7 +204,7 @@ class RigidContact:
             self.bodies.colliding,
             self._moving,
             self._advance_on_device,
-            self._largest_half,
+            self._largest_half + self._longest / math.sqrt(3.0),  # a triangle's middle is no farther from a node
             is_short(len(nodes), NODE_NS),
         )
         return min(at_most, 1.0 / max(float(rate), 1.0e-30))

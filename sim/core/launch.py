@@ -143,18 +143,18 @@ class FastKernel:
 
     def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
         """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
-        began = time.perf_counter()
         flat = tuple(flattened(args))
+        began = time.perf_counter()
+        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
+        compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
+        if (seconds := time.perf_counter() - began) > SLOW_S:
+            for tell in _tell_compiled:
+                tell(self.__name__, seconds)
         result = self._primal(*flat)
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
             self._sort_arguments()
-        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
-        compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
         self._compiled[self._key(self._used(args) if self._has_bundles else args)] = kernel, compiled
-        if (seconds := time.perf_counter() - began) > SLOW_S:
-            for tell in _tell_compiled:
-                tell(self.__name__, seconds)
         return result.to_numpy().tolist() if self._returns_vector else result
 
     def _launch(self, program: Any, compiled: Any, context: Any, used: Sequence[Any], passed: list[Any]) -> Any:

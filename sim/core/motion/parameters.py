@@ -40,9 +40,10 @@ def placed_at_first_keyframe(data: Any, what: str) -> Any:
     for key in ("position", "rotation_deg"):
         if key not in data:
             continue
-        if not isinstance(data[key], list | tuple):
+        there = start.get(key, (0.0, 0.0, 0.0))
+        if not (isinstance(data[key], list | tuple) and isinstance(there, list | tuple)):
             return data  # its own validation, too
-        if tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
+        if tuple(data[key]) != tuple(there):
             raise ValueError(f"{key} differs from that of the first keyframe, which places the {what}; remove {key}")
     return {**data, **start}
 
