@@ -45,6 +45,16 @@ class View:
     focal_length_mm: float
     focus_distance: float
 
+    def axes(self) -> Array:
+        """The camera's axes, right, up and back, as rows (3, 3)."""
+        back = np.subtract(self.position, self.look_at)
+        back = back / max(float(np.linalg.norm(back)), 1e-12)
+        right = np.cross((0.0, 0.0, 1.0), back)
+        if np.linalg.norm(right) < 1e-9:  # straight up or down
+            right = np.array([1.0, 0.0, 0.0])
+        right = right / np.linalg.norm(right)
+        return np.stack([right, np.cross(back, right), back])
+
 
 def frame_points(points: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
     """The closest view from the direction (`AZIMUTH`, `ELEVATION`) that shows all points, centred.

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 POSES_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Place of a body's mesh: its origin [m], and unit quaternion w, x, y, z."""
+
+    position: Sequence[float]
+    orientation: Sequence[float]
+
+
+def the_short_way(quaternions: ArrayLike) -> NDArray[np.float64]:
+    """The same turns, (n, 4), each by the sign that is nearer to the one before: nothing turns the long way round."""
+    rows = np.asarray(quaternions, np.float64).reshape(-1, 4)
+    flips = np.where(np.einsum("ij,ij->i", rows[1:], rows[:-1]) < 0.0, -1.0, 1.0)
+    signed: NDArray[np.float64] = rows * np.cumprod([1.0, *flips])[:, None]
+    return signed
 
 
 def write_poses(path: Path, frame: int, bodies: Mapping[str, Mapping[str, NDArray[np.generic]]]) -> None:

@@ -19,6 +19,7 @@ from blender_scripts.ply import SurfaceMesh
 from render.camera_path import SENSOR_WIDTH_MM, View
 from render.errors import InvalidFileError
 from render.parameters import MaterialParameters
+from render.poses import Placement, the_short_way
 from render.preview_looks import PreviewLook, preview_of
 from render.spec import (
     MeshObject,
@@ -43,14 +44,6 @@ class Points:
     velocity: ArrayLike
     radius: ArrayLike
     ids: ArrayLike | None = None
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Place of a body's mesh: its origin [m], and unit quaternion w, x, y, z."""
-
-    position: Sequence[float]
-    orientation: Sequence[float]
 
 
 def write_usd_frame(
@@ -285,15 +278,10 @@ def _move(made: Any, placements: Mapping[Any, MeshObject | Placement]) -> None:
     from pxr import Gf
 
     translate, orient = made.AddTranslateOp(), made.AddOrientOp()
-    before: NDArray[np.float64] | None = None
-    for frame, place in placements.items():
-        quaternion = np.asarray(place.orientation, np.float64)
-        if before is not None and float(before @ quaternion) < 0.0:
-            quaternion = -quaternion
-        before = quaternion
-        w, x, y, z = map(float, quaternion)
+    turns = the_short_way([place.orientation for place in placements.values()])
+    for (frame, place), turn in zip(placements.items(), turns, strict=True):
         translate.Set(Gf.Vec3d(*map(float, place.position)), _time(frame))
-        orient.Set(Gf.Quatf(w, x, y, z), _time(frame))
+        orient.Set(Gf.Quatf(*turn.tolist()), _time(frame))
 
 
 def _add_camera(stage: Any, spec: RenderSpec, views: Mapping[int, View]) -> None:
@@ -323,14 +311,8 @@ def _looking(view: View) -> Any:
     """From the camera's axes, right, up and back, to the world's."""
     from pxr import Gf
 
-    back = np.subtract(view.position, view.look_at)
-    back = back / max(float(np.linalg.norm(back)), 1e-12)
-    right = np.cross((0.0, 0.0, 1.0), back)
-    if np.linalg.norm(right) < 1e-9:  # straight up or down
-        right = np.array([1.0, 0.0, 0.0])
-    right = right / np.linalg.norm(right)
     rows = np.eye(4)
-    rows[:3, :3] = right, np.cross(back, right), back
+    rows[:3, :3] = view.axes()
     rows[3, :3] = view.position
     return Gf.Matrix4d(*rows.ravel().tolist())
 

@@ -25,7 +25,7 @@ from pipeline.queue.submitting import submit as submit_to_queue
 if TYPE_CHECKING:
     from pipeline.stages.export import ExportStage
 
-FORMATS = ("usd", "blend", "abc", "vtk")
+FORMATS = ("usd", "blend", "abc", "vtk", "gltf")
 """As the stages have them, which are too heavy to be imported for `--help`."""
 OPENJD = "openjd"
 
@@ -33,7 +33,9 @@ OPENJD = "openjd"
 @click.command()
 @job_options
 @click.option("--to", "wanted", type=click.Choice([*FORMATS, OPENJD]), required=True, help="The format; see below.")
-@click.option("--frames", metavar="RANGES", help="Only these frames: 7 or 0-29 or 0-29,60-89; all if omitted.")
+@click.option(
+    "--frames", metavar="RANGES", help="Only these frames: 7 or 0-29,60-89, or every fourth of 0-99x4; all if omitted."
+)
 @click.option(
     "-o",
     "target",
@@ -70,11 +72,13 @@ def export(
     blend   Blender 4.5 LTS and later: the whole lit scene, which renders the film's frames
     abc     Alembic, one file: bodies, surfaces, cloths, whitewater and camera; no smoke, no materials
     vtk     ParaView: one time series of particles, surfaces, cloths, bodies and smoke, with names and units
+    gltf    the web, one .glb: bodies, surfaces, cloths and camera; no smoke, no whitewater, 100 MB at most
     openjd  a farm manager: an Open Job Description template of the whole job, which runs it there
 
     \b
     pipeline export my-film --to usd
     pipeline export my-film --to blend --frames 10-40 -o ~/for-anna
+    pipeline export my-film --to gltf --frames 0-239x4
     pipeline export dam.toml --to vtk --set fluid.water.particle_radius=0.01
     pipeline export dam.toml --to openjd --output /shared/renders
     """
@@ -140,6 +144,8 @@ def _export(
     told = found.stage.opened_by.format(file=place / found.root)
     click.echo(f"{place / found.root}: {found.told}, {wording.size(found.bytes)} in {len(found.files)} files")
     click.echo(f"  {told}")
+    if found.left_out:
+        click.echo(f"  left out, as {found.stage.format} has no place for it: {', '.join(found.left_out)}")
 
 
 def _stage(wanted: str) -> ExportStage:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -109,21 +110,22 @@ def parse_end(text: str) -> tuple[str, frozenset[int] | None]:
 
 
 _MOST_FRAMES = 1_000_000
+_RANGE = re.compile(r"(\d+)(?:-(\d+)(?:x([1-9]\d*))?)?", re.ASCII)
 
 
 def parse_frames(text: str) -> frozenset[int]:
-    """Frame numbers from `3`, `0-9` or `0-9,20,30-39`. Raises PlanError."""
+    """Frame numbers from `3`, `0-9`, `0-9,20,30-39` or `0-99x10`, every tenth. Raises PlanError."""
     frames: set[int] = set()
     for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        if not first.isdigit() or (dash and not last.isdigit()):
-            raise PlanError(f'"{part.strip()}" is not a frame or a range of frames, like 7 or 0-29')
-        start, stop = int(first), int(last or first)
+        match = _RANGE.fullmatch(part.strip())
+        if match is None:
+            raise PlanError(f'"{part.strip()}" is not a frame or a range of frames, like 7 or 0-29 or 0-29x5')
+        start, stop, step = int(match[1]), int(match[2] or match[1]), int(match[3] or 1)
         if stop < start:
             raise PlanError(f'"{part.strip()}" runs backwards')
         if stop - start > _MOST_FRAMES:
             raise PlanError(f'"{part.strip()}" is more than a million frames')
-        frames.update(range(start, stop + 1))
+        frames.update(range(start, stop + 1, step))
     return frozenset(frames)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from pipeline.base.errors import PipelineError
@@ -29,6 +30,7 @@ class Export:
         files: all that has to lie together, that one last.
         frames: those that are in it.
         bytes: of all files.
+        left_out: what of the job the format has no place for.
     """
 
     stage: ExportStage
@@ -36,11 +38,16 @@ class Export:
     files: tuple[ArtifactPath, ...]
     frames: tuple[int, ...]
     bytes: int
+    left_out: tuple[str, ...]
 
     @property
     def told(self) -> str:
         """Its frames, for people."""
-        ranges = frame_ranges(self.frames, range(max(self.frames) + 1))
+        steps = {later - earlier for earlier, later in pairwise(self.frames)}
+        if len(steps) == 1 and steps != {1}:
+            ranges = f"{self.frames[0]}-{self.frames[-1]}x{steps.pop()}"
+        else:
+            ranges = frame_ranges(self.frames, range(max(self.frames) + 1))
         return f"{counted(len(self.frames), 'frame')} ({ranges})"
 
 
@@ -52,7 +59,7 @@ def survey_export(job: Job, layout: JobLayout, stages: Sequence[Stage], end: str
     assert isinstance(stage, ExportStage)
     files = tuple(stage.belonging(tasks))
     size = sum(layout.path(each).stat().st_size for each in files)
-    return Export(stage, stage.root(job), files, tuple(stage.chosen(job)), size)
+    return Export(stage, stage.root(job), files, tuple(stage.chosen(job)), size, tuple(stage.left_out(job)))
 
 
 def copy_export(export: Export, layout: JobLayout, target: Path) -> int:

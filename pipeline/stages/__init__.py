@@ -9,6 +9,7 @@ from pipeline.stages.bodies import BodiesStage
 from pipeline.stages.bounds import BoundsStage
 from pipeline.stages.export import ExportStage
 from pipeline.stages.export_blend import AbcExport, BlendExport
+from pipeline.stages.export_gltf import GltfExport
 from pipeline.stages.export_usd import UsdExport
 from pipeline.stages.export_vtk import VtkExport
 from pipeline.stages.movie import MovieStage
@@ -18,7 +19,7 @@ from pipeline.stages.simulate import SimulateStage
 from pipeline.stages.whitewater import WhitewaterStage
 
 EXPORTS: dict[str, ExportStage] = {
-    stage.format: stage for stage in (UsdExport(), BlendExport(), AbcExport(), VtkExport())
+    stage.format: stage for stage in (UsdExport(), BlendExport(), AbcExport(), VtkExport(), GltfExport())
 }
 """What a job can be exported to, by the name of the format."""
 

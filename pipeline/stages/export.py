@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from copy import copy
 from pathlib import PurePosixPath
 from typing import Self
@@ -12,7 +12,12 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
-from pipeline.stages.base import Stage
+from pipeline.stages.base import Stage, TaskContext
+from pipeline.stages.render_scene import camera_path, framed_points, view_at
+from pipeline.store.cache import read_frame
+from render.camera_path import View
+from render.poses import Placement
+from render.spec import MovingMeshObject, RenderSpec
 from sim.rigid.parameters import RigidBodyParameters
 
 PREFIX = "export-"  # begins the names of these stages; that of the format follows
@@ -60,11 +65,38 @@ class ExportStage(Stage):
             raise PlanError(f"{self.format} plays every frame from its first to its last; name one range, like 10-40")
         return list(frames)
 
+    def left_out(self, job: Job) -> list[str]:  # noqa: ARG002
+        """What of a job the format has no place for, in words."""
+        return []
+
     def belonging(self, tasks: list[Task]) -> list[ArtifactPath]:
         """What has to lie together for the export to be whole, the file to open last."""
         mine = [task for task in tasks if task.stage == self.name]
         shown = [each for each in mine[-1].inputs if PurePosixPath(each).parts[0] in self.refers_to]
         return [*dict.fromkeys([*shown, *(output for task in mine for output in task.outputs)])]
+
+
+def motion(
+    context: TaskContext, spec: RenderSpec, frames: Collection[int]
+) -> tuple[dict[str, dict[int, Placement]], dict[int, View]]:
+    """Places of the objects that move as a whole, by frame, and views of the camera, one if it stands still."""
+    job, layout = context.job, context.layout
+    moving = [each for each in spec.objects if isinstance(each, MovingMeshObject)]
+    placements: dict[str, dict[int, Placement]] = {each.name: {} for each in moving}
+    camera = camera_path(job, framed_points(job, layout))
+    views: dict[int, View] = {}
+    for done, frame in enumerate(frames):
+        poses = {}
+        if job.moving_bodies:
+            cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies
+            poses = {name: cached[name].arrays for name in job.moving_bodies}
+        for each in moving:
+            pose = poses[each.body]
+            placements[each.name][frame] = Placement(pose["position"].tolist(), pose["orientation"].tolist())
+        if camera.moves or not views:
+            views[frame] = view_at(job, camera, frame, poses)
+        context.progress(done, len(frames), "camera and bodies")
+    return placements, views
 
 
 def frame_of(artifact: ArtifactPath) -> int:

@@ -152,6 +152,10 @@ class AbcExport(_SceneExport):
         read = [path for frame in self.chosen(job) for path in _played(job, layout, frame, volumes=True)]
         return [self._scene_task(job, layout, read)]
 
+    def left_out(self, job: Job) -> list[str]:
+        """Smoke."""
+        return [f"smoke ({each.name})" for each in job.smoke]
+
     def run(self, context: TaskContext) -> None:
         """Write the file."""
         self._write_scene(context)

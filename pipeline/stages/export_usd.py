@@ -10,14 +10,13 @@ from pipeline.kinds.base import Kind
 from pipeline.kinds.table import bodies, material_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.export import ExportStage, frame_of, meshes_of
-from pipeline.stages.render_scene import camera_path, framed_points, render_spec, view_at
-from pipeline.store.cache import read_compact, read_frame
-from render.camera_path import View
+from pipeline.stages.export import ExportStage, frame_of, meshes_of, motion
+from pipeline.stages.render_scene import framed_points, render_spec
+from pipeline.store.cache import read_compact
 from render.meshes import read_ply
 from render.point_clouds import KINDS, drawn_radii, read_point_cloud
 from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, PointSequenceObject, RenderSpec
-from render.usd_files import Placement, Points, validate_usd, write_usd_frame, write_usd_scene
+from render.usd_files import Points, validate_usd, write_usd_frame, write_usd_scene
 
 FOLDER = "usd"
 MANIFEST = ArtifactPath(f"{FOLDER}/manifest.usda")
@@ -132,8 +131,7 @@ def _write_frame(context: TaskContext, frame: int) -> None:
 
 def _write_scene(context: TaskContext) -> None:
     job, layout, task = context.job, context.layout, context.task
-    framed = framed_points(job, layout)
-    spec = render_spec(job, layout, framed)
+    spec = render_spec(job, layout, framed_points(job, layout))
     layers = {frame_of(each): each for each in task.inputs if each.startswith(f"{FOLDER}/")}
     meshes = {}
     for each in spec.objects:
@@ -141,21 +139,7 @@ def _write_scene(context: TaskContext) -> None:
             meshes[each.name] = read_ply(layout.root / each.file)
         elif isinstance(each, MeshSequenceObject) and each.name in {cloth.name for cloth in job.cloth}:
             meshes[each.name] = read_ply(layout.root / each.file.replace("{frame}", f"{min(layers):06d}"))
-    moving = [each for each in spec.objects if isinstance(each, MovingMeshObject)]
-    placements: dict[str, dict[int, Placement]] = {each.name: {} for each in moving}
-    path_of_camera = camera_path(job, framed)
-    views: dict[int, View] = {}
-    for frame in layers:
-        poses = {}
-        if job.moving_bodies:
-            cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies
-            poses = {name: cached[name].arrays for name in job.moving_bodies}
-        for each in moving:
-            pose = poses[each.body]
-            placements[each.name][frame] = Placement(pose["position"].tolist(), pose["orientation"].tolist())
-        if path_of_camera.moves or not views:
-            views[frame] = view_at(job, path_of_camera, frame, poses)
-        context.progress(len(views), len(layers), "camera and bodies")
+    placements, views = motion(context, spec, layers)
     with (
         context.committing(MANIFEST, validate_usd) as manifest,
         context.committing(task.outputs[1], validate_usd) as path,

@@ -36,10 +36,25 @@ def exported(text: str, end: str) -> dict[str, object]:
     return {task.id: task for task in tasks if task.stage.startswith("export-")}
 
 
-def test_alembic_is_refused_for_a_job_of_smoke_alone():
+@pytest.mark.parametrize("name", ["abc", "gltf"])
+def test_what_has_no_volumes_is_refused_for_a_job_of_smoke_alone(name):
     with pytest.raises(PlanError, match="no volumes"):
-        exported(SMOKE, "export-abc")
-    assert [*exported(SMOKE + BALL, "export-abc")] == ["export-abc/scene"]
+        exported(SMOKE, f"export-{name}")
+    assert [*exported(SMOKE + BALL, f"export-{name}")] == [f"export-{name}/scene"]
+    assert EXPORTS[name].left_out(job_of_text(SMOKE + BALL, Path("job.toml"))) == ["smoke (plume)"]
+
+
+def test_gltf_says_that_it_has_no_zoom():
+    keyframes = """
+[camera]
+keyframe = [{ time_s = 0.0, position = [1.0, 0.0, 0.5] }, { time_s = 1.0, position = [1.0, 0.0, 0.5]%s }]
+"""
+    fixed, zoomed = (
+        job_of_text(BALL.join(["name = 'a'\nframes = 6\n", keyframes % each]), Path("job.toml"))
+        for each in ("", ", focal_length_mm = 90.0")
+    )
+    assert EXPORTS["gltf"].left_out(fixed) == []
+    assert EXPORTS["gltf"].left_out(zoomed) == ["the camera's zoom"]
 
 
 @pytest.mark.parametrize("name", ["blend", "abc"])
@@ -50,6 +65,7 @@ def test_what_plays_every_frame_refuses_gaps(name):
 
 
 def test_frames_are_those_that_were_chosen():
+    assert [*exported(SMOKE + BALL, "export-usd:1-5x3")] == [*exported(SMOKE + BALL, "export-usd:1,4")]
     assert [*exported(SMOKE + BALL, "export-usd:1,4")] == ["export-usd/000001", "export-usd/000004", "export-usd/scene"]
 
 

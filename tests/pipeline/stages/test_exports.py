@@ -15,8 +15,10 @@ from exported_jobs import FRAMES, simulated
 from films import Studio
 from places import PROJECT
 
+from pipeline.job.loading import load_job
 from pipeline.store.cache import read_frame
 from render.errors import InvalidFileError
+from render.gltf_files import read_glb
 from render.meshes import read_ply
 from render.pictures import read_picture
 from render.point_clouds import KINDS, read_point_cloud
@@ -276,6 +278,90 @@ print("TOLD", json.dumps(told))
     pose = cached(studio, "ball", LAST).arrays
     np.testing.assert_allclose(np.mean(told["ball"][0], axis=0), pose["position"], atol=1e-4)
     assert len(told["water_foam"][0]) == (cloud.kind == KINDS.index("foam")).sum()
+
+
+# --- the web ---
+
+
+@pytest.fixture(scope="module")
+def gltf(studio) -> Path:
+    ended = studio.run("export", "tiny", "--to", "gltf").assert_code(0)
+    assert "left out" in ended.out and "smoke (plume), whitewater (water)" in ended.out
+    return studio.layout.root / "tiny.glb"
+
+
+def test_a_reader_of_gltf_finds_metres_y_up_and_every_face(studio, gltf):
+    import trimesh
+
+    scene = trimesh.load_scene(gltf)
+    for frame in range(FRAMES):
+        mesh, read = surface(studio, frame), scene.geometry[f"water.{frame}"]
+        assert len(read.faces) == len(mesh.faces)
+        np.testing.assert_array_equal(read.vertices, mesh.vertices[:, [0, 2, 1]] * np.float32([1, 1, -1]))
+    assert len(scene.geometry["sheet"].vertices) == len(cached(studio, "sheet", 0).arrays["position"])
+    place = scene.graph.get("ball")[0][:3, 3]
+    np.testing.assert_allclose(place, cached(studio, "ball", 0).arrays["position"][[0, 2, 1]] * [1, 1, -1], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(scene.geometry["ball"].vertices, axis=0), 0.16, rtol=0.02)  # 8 cm of radius
+    assert not np.allclose(scene.geometry["ball"].vertex_normals, 0.0)
+
+
+GLTF_AT = """
+import json, sys, bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.context.scene.render.fps = 60
+bpy.ops.import_scene.gltf(filepath=sys.argv[1])
+scene, told = bpy.context.scene, {}
+for moment in map(float, sys.argv[2:]):
+    scene.frame_set(int(moment), subframe=moment % 1)
+    graph, found = bpy.context.evaluated_depsgraph_get(), {}
+    for each in bpy.data.objects:
+        made = each.evaluated_get(graph)
+        if each.type == "MESH" and max(made.matrix_world.to_scale()) > 0.5:
+            found[each.name] = [list(made.matrix_world @ vertex.co) for vertex in made.data.vertices]
+        elif each.type == "CAMERA":
+            found[each.name] = [list(row) for row in made.matrix_world]
+    told[moment] = found
+glass = bpy.data.materials["water"].node_tree.nodes["Principled BSDF"].inputs
+told["water"] = [glass["Transmission Weight"].default_value, glass["IOR"].default_value]
+told["angle"] = bpy.data.cameras[0].angle_y
+print("TOLD", json.dumps(told))
+"""
+
+
+def test_blender_plays_the_gltf_as_the_cache_has_it(studio, gltf):
+    argv = [sys.executable, "-c", GLTF_AT, str(gltf), "0", str(LAST), str(LAST - 0.5)]
+    printed = subprocess.run(argv, check=True, capture_output=True, text=True, cwd=PROJECT).stdout
+    told = json.loads(next(line for line in printed.splitlines() if line.startswith("TOLD "))[5:])
+    domain = load_job(studio.layout.job_file).domain
+    assert told["water"] == pytest.approx([1.0, 1.33])
+    assert told["angle"] == pytest.approx(2.0 * np.arctan(18.0 / 50.0 * 54 / 96), abs=1e-4)
+    for frame in (0, LAST):
+        found = told[f"{float(frame)}"]
+        assert {name for name in found if name.startswith("water")} == {f"water.{frame}"}  # one surface at a time
+        np.testing.assert_allclose(found[f"water.{frame}"], surface(studio, frame).vertices, atol=1e-6)
+        np.testing.assert_allclose(found["sheet"], cached(studio, "sheet", frame).arrays["position"], atol=1e-5)
+        pose = cached(studio, "ball", frame).arrays
+        ball = np.asarray(found["ball"])
+        np.testing.assert_allclose((ball.min(axis=0) + ball.max(axis=0)) / 2, pose["position"], atol=2e-3)
+        camera = np.asarray(found["camera"])
+        np.testing.assert_allclose(camera[:3, 3], [0.7, -1.2, 0.7], atol=1e-6)
+        aim = np.mean([domain.min, domain.max], axis=0) - camera[:3, 3]
+        np.testing.assert_allclose(-camera[:3, 2], aim / np.linalg.norm(aim), atol=1e-5)
+    between = told[f"{LAST - 0.5}"]
+    assert f"water.{LAST - 1}" in between  # it stays until the next one
+    halves = [cached(studio, "sheet", frame).arrays["position"] for frame in (LAST - 1, LAST)]
+    np.testing.assert_allclose(between["sheet"], np.mean(halves, axis=0), atol=1e-5)
+
+
+def test_gltf_of_some_frames_keeps_their_times_and_its_bytes(studio, gltf):
+    before = gltf.read_bytes()
+    ended = studio.run("export", "tiny", "--to", "gltf", "--frames", f"1-{LAST}x2").assert_code(0)
+    assert f"2 frames (1-{LAST}x2)" in ended.out
+    document, arrays = read_glb(gltf.read_bytes())
+    ends = [arrays[each["input"]][-1] for each in document["animations"][0]["samplers"]]
+    assert max(ends) == pytest.approx((LAST - 1) / 60)
+    studio.run("export", "tiny", "--to", "gltf").assert_code(0)
+    assert gltf.read_bytes() == before
 
 
 # --- exports as stages ---
