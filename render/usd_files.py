@@ -7,6 +7,7 @@ are preview surfaces. Nothing of the set is in it: neither ground nor lamps.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ from render.spec import (
 from render.suffixed import read_as, written_as
 
 WORLD = "/World"
+RESERVED = ("camera", "Materials")
+"""Names below `WORLD` that no object may have."""
 _FIELDS = (("density", "float", ""), ("temperature", "float", ""), ("velocity", "vector", "vector"))
 """Grids of a smoke's files: name, kind of values, role of vectors."""
 
@@ -183,10 +186,13 @@ def _save(layer: Any, path: Path, suffix: str) -> None:
 # --- prims ---
 
 
-def _place_of(name: str) -> str:
-    from pxr import Tf
+def prim_name(name: str) -> str:
+    """Name of the prim of an object: letters, digits and `_`."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)
 
-    return f"{WORLD}/{Tf.MakeValidIdentifier(name)}"
+
+def _place_of(name: str) -> str:
+    return f"{WORLD}/{prim_name(name)}"
 
 
 def _define_mesh(stage: Any, name: str) -> Any:
@@ -288,7 +294,7 @@ def _add_camera(stage: Any, spec: RenderSpec, views: Mapping[int, View]) -> None
     """The camera, whose lens and sensor USD has in tenths of a unit, here of a metre."""
     from pxr import Gf, UsdGeom
 
-    camera = UsdGeom.Camera.Define(stage, f"{WORLD}/camera")
+    camera = UsdGeom.Camera.Define(stage, f"{WORLD}/{RESERVED[0]}")
     width, height = spec.render.resolution
     longer = SENSOR_WIDTH_MM / 100.0
     camera.CreateHorizontalApertureAttr(longer * min(1.0, width / height))
@@ -321,8 +327,8 @@ def _paint(stage: Any, prim: Any, name: str, look: PreviewLook) -> None:
     """Bind a preview surface; the colour of the prim is its own, too."""
     from pxr import Gf, Sdf, UsdGeom, UsdShade
 
-    place = f"{WORLD}/Materials/{_place_of(name).rpartition('/')[2]}"
-    UsdGeom.Scope.Define(stage, f"{WORLD}/Materials")
+    place = f"{WORLD}/{RESERVED[1]}/{_place_of(name).rpartition('/')[2]}"
+    UsdGeom.Scope.Define(stage, f"{WORLD}/{RESERVED[1]}")
     material = UsdShade.Material.Define(stage, place)
     shader = UsdShade.Shader.Define(stage, f"{place}/surface")
     shader.CreateIdAttr("UsdPreviewSurface")

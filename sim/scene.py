@@ -39,7 +39,7 @@ class SceneParameters(Parameters):
             index = next(number for number, fluid in enumerate(self.fluid) if fluid.name == sticky[0])
             raise KeyRefusedError(
                 ("fluid", index, "adhesion"),
-                f'of "{sticky[0]}" has no reaction on bodies in this version, and would drive "{free[0]}" by '
+                f'adhesion of "{sticky[0]}" has no reaction on bodies in this version, and would drive "{free[0]}" by '
                 'itself; set adhesion = 0, or make the bodies "static" or "kinematic"',
             )
         return self

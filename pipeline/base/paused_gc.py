@@ -1,4 +1,4 @@
-"""The garbage collector, paused while very many objects are made at once."""
+"""The garbage collector, paused while very many objects are made at once, or while it must not run."""
 
 import gc
 from collections.abc import Iterator

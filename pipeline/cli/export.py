@@ -119,8 +119,9 @@ def _export(
     from pipeline.queue.job_queue import Desired, JobQueue
     from pipeline.run.checked_job import read_own_job
     from pipeline.run.goal import read_goal, write_goal
-    from pipeline.show.handing_over import PREFIX, copy_export, refuse_if_busy, survey_export
+    from pipeline.show.handing_over import copy_export, refuse_if_busy, survey_export
     from pipeline.stages import STAGES
+    from pipeline.stages.export import PREFIX
 
     loaded = read_own_job(job_file, overrides, preview=preview, until=(end,))
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)

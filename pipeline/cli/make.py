@@ -56,7 +56,7 @@ def new(name: Path, template: str) -> None:
 @until_option
 @click.option("--json", "as_json", is_flag=True, help="Print the whole job, defaults included, as JSON.")
 def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tuple[str, ...], as_json: bool) -> None:
-    """Say what is wrong with a job file, how large the job is, and what it will take.
+    """Say what is wrong with a job file, how large it is, and what it will take.
 
     \b
     pipeline check my-film

@@ -48,6 +48,8 @@ def variants(settings: Sequence[str]) -> list[Variant]:
             problems.append(f"--set {setting}: expected path.to.key=value,value,...")
             continue
         written.append((key.strip(), list(dict.fromkeys(values))))
+    if any(key == "name" for key, _ in written):
+        problems.append("--set name: the jobs of a sweep are called by their values; leave it out")
     counts = Counter(key for key, _ in written)
     problems += [
         f"--set {key}: is there {count} times; give all its values at once"

@@ -15,7 +15,6 @@ from pipeline.model.job import Job
 from pipeline.model.problems import Findings, Problem, suggestion
 from pipeline.stages import STAGES
 from pipeline.stages.movie import MovieStage
-from pipeline.stages.render import RenderStage
 
 PICTURE_KEYS = frozenset({"camera", "light", "set", "material", "render", "movie"})
 """Tables of the job file that decide nothing but pictures."""

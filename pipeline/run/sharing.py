@@ -38,8 +38,9 @@ class Shared(NamedTuple):
 
 
 def write_siblings(layout: JobLayout, names: Collection[str]) -> None:
-    """Name the other jobs of a study, which lie beside it."""
-    replace_durably(layout.siblings, json.dumps({"jobs": sorted(names)}) + "\n")
+    """Name the other jobs of a study, which lie beside it, with those that are named already and there."""
+    known = (sibling.root.name for sibling in read_siblings(layout))
+    replace_durably(layout.siblings, json.dumps({"jobs": sorted({*names, *known})}) + "\n")
 
 
 def read_siblings(layout: JobLayout) -> list[JobLayout]:

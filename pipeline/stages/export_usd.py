@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
 from pipeline.kinds.base import Kind
-from pipeline.kinds.table import bodies, material_of, products_of
+from pipeline.kinds.table import bodies, drawn_bodies, material_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, frame_of, meshes_of, motion
@@ -16,7 +18,7 @@ from pipeline.store.cache import read_compact
 from render.meshes import read_ply
 from render.point_clouds import KINDS, drawn_radii, read_point_cloud
 from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, PointSequenceObject, RenderSpec
-from render.usd_files import Points, validate_usd, write_usd_frame, write_usd_scene
+from render.usd_files import RESERVED, WORLD, Points, prim_name, validate_usd, write_usd_frame, write_usd_scene
 
 FOLDER = "usd"
 MANIFEST = ArtifactPath(f"{FOLDER}/manifest.usda")
@@ -79,11 +81,20 @@ class UsdExport(ExportStage):
         )
         return [*tasks, scene]
 
-    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
-        """No library of USD."""
-        if tool_version("usd-core") != "absent":
-            return []
-        return ["USD is written by the package usd-core; install it: pip install usd-core"]
+    def preflight(self, job: Job) -> list[str]:
+        """No library of USD, and names that would be one there."""
+        if tool_version("usd-core") == "absent":
+            return ["USD is written by the package usd-core; install it: pip install usd-core"]
+        drawn = [each.name for _, _, each in drawn_bodies(job, JobLayout(Path()))]
+        names: dict[str, list[str]] = {}
+        for name in (*RESERVED, *drawn, *(particles for _, _, particles in _particles(job))):
+            names.setdefault(prim_name(name), []).append(name)
+        return [
+            f"{' and '.join(theirs)} would both be {WORLD}/{prim} in USD, whose names have letters, digits and _; "
+            "give one another name"
+            for prim, theirs in names.items()
+            if len(theirs) > 1
+        ]
 
     def run(self, context: TaskContext) -> None:
         """Write the layer of a frame, or the scene."""

@@ -5,6 +5,7 @@ a topic, in order, by way of the scheduler: the runner needs no way to the worke
 """
 
 import asyncio
+import gc
 import logging
 import pickle
 import uuid
@@ -18,6 +19,7 @@ from typing import Any
 
 from distributed import Client, Future
 
+from pipeline.base.paused_gc import many_objects
 from pipeline.base.task import TaskId
 from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.run.executors import dask_driver
@@ -84,8 +86,12 @@ class Connection:
         self._closing = False
         for name in ("distributed", "distributed.client"):  # what matters of it is said here, in our own words
             logging.getLogger(name).setLevel(logging.CRITICAL)
+        # A client that could not connect ends when it is collected; within the making of another it would take a lock
+        # that this holds, and wait for ever.
+        gc.collect()
         try:
-            self._client = Client(address, timeout=_CONNECT_S, set_as_default=False, name="pipeline")
+            with many_objects():
+                self._client = Client(address, timeout=_CONNECT_S, set_as_default=False, name="pipeline")
         except AssertionError as error:  # Dask's way to say that its thread did not start within ten seconds
             raise OSError("Dask did not start in time: this machine is very busy, or was asleep") from error
         try:

@@ -75,6 +75,7 @@ def test_a_value_that_is_given_twice_is_one_job():
         (["fps=30"], ["nothing varies"]),
         (["fps", "x=1,"], ["--set fps:", "--set x=1,:"]),
         (["fps=1,2", "fps=3,4"], ["fps: is there 2 times"]),
+        (["name=a,b"], ["--set name: "]),
         (["a=" + ",".join(map(str, range(40))), "b=" + ",".join(map(str, range(40)))], ["1,600 jobs"]),
     ],
 )

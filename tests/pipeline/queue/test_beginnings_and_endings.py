@@ -11,7 +11,7 @@ from command_line import pipeline
 from places import PROJECT
 
 from pipeline.base.layout import JobLayout
-from pipeline.queue.submitting import _make_folder
+from pipeline.queue.submitting import make_folder
 
 SCENE = """
 name = "small"
@@ -74,5 +74,5 @@ def test_a_host_that_looks_at_the_same_moment_whether_the_folder_can_be_written_
         self.unlink()  # by the other host
 
     monkeypatch.setattr(Path, "touch", touched_and_removed)
-    _make_folder(JobLayout(tmp_path / "film"))
+    make_folder(JobLayout(tmp_path / "film"))
     assert [*(tmp_path / "film").iterdir()] == []

@@ -140,13 +140,31 @@ def test_files_are_copied_where_there_are_no_hard_links(farm, tmp_path, monkeypa
     assert layout.path(step_artifact(0)).stat().st_ino != owner.path(step_artifact(0)).stat().st_ino
 
 
+@pytest.mark.parametrize("loses", [lambda path: path.unlink(), lambda path: path.write_bytes(b"made anew")])
+def test_what_another_job_removes_or_makes_anew_meanwhile_is_made_here(farm, tmp_path, monkeypatch, loses):
+    farm.job("a")
+    farm.run("submit", "a.toml")
+    owner, layout = farm.layout("a"), JobLayout(tmp_path / "renders" / "b")
+    layout.root.mkdir()
+    receipt = read_receipt(owner, step_artifact(0))
+    assert receipt is not None
+    loses(owner.path(step_artifact(0)))
+    with pytest.raises(FileNotFoundError):
+        take_over(layout, receipt, owner)
+    assert read_receipt(layout, step_artifact(0)) is None
+    assert [path for path in layout.path(step_artifact(0)).parent.iterdir() if path.is_file()] == []
+
+
 def test_siblings_lie_beside_a_job_and_nowhere_else(tmp_path):
     layout = JobLayout(tmp_path / "a")
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     write_siblings(layout, ["a", "b", "gone"])
     assert [each.root.name for each in read_siblings(layout)] == ["b"]
-    for text in ("", "[]", '{"jobs": 3}', '{"jobs": ["../b", "/etc", ".."]}'):
+    (tmp_path / "c").mkdir()
+    write_siblings(layout, ["a", "c"])  # the sweep has other values now
+    assert [each.root.name for each in read_siblings(layout)] == ["b", "c"]
+    for text in ("", "[]", '{"jobs": 3}', '{"jobs": ["../b", "/etc", ".."]}', "[" * 200_000):
         layout.siblings.write_text(text)
         assert read_siblings(layout) == []
 

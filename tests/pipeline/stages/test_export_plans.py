@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 from planned_jobs import LAYOUT
 
-from pipeline.base.errors import PipelineError, PlanError
+from pipeline.base.errors import JobFileError, PipelineError, PlanError
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import job_of_text
+from pipeline.run.checked_job import load_checked_job, needs_pictures
 from pipeline.run.plan import plan_job
 from pipeline.show.handing_over import refuse_if_busy
 from pipeline.stages import EXPORTS, STAGES
@@ -42,6 +43,29 @@ def test_what_has_no_volumes_is_refused_for_a_job_of_smoke_alone(name):
         exported(SMOKE, f"export-{name}")
     assert [*exported(SMOKE + BALL, f"export-{name}")] == [f"export-{name}/scene"]
     assert EXPORTS[name].left_out(job_of_text(SMOKE + BALL, Path("job.toml"))) == ["smoke (plume)"]
+
+
+@pytest.mark.parametrize(
+    ("names", "prim"), [(("a-b", "a_b"), "a_b"), (("camera", "ball"), "camera"), (("Materials", "ball"), "Materials")]
+)
+def test_names_that_would_be_one_in_usd_are_refused_before_anything_runs(names, prim):
+    first, second = (BALL.replace('"ball"', f'"{name}"') for name in names)
+    job = job_of_text(f'name = "tank"\nframes = 2\n{first}{second}', Path("job.toml"))
+    (problem,) = EXPORTS["usd"].preflight(job)
+    assert f"/World/{prim} " in problem
+    assert EXPORTS["usd"].preflight(job_of_text(SMOKE + BALL, Path("job.toml"))) == []
+
+
+@pytest.mark.parametrize(("name", "draws"), [("blend", True), ("abc", True), ("usd", False), ("vtk", False)])
+def test_what_is_wrong_with_looks_is_told_where_an_export_draws(name, draws, tmp_path):
+    path = tmp_path / "tank.toml"
+    path.write_text(f'name = "tank"\nframes = 2\n{BALL}[material.ball]\nlook = "fire"\n')
+    assert needs_pictures([f"export-{name}:0-1"]) is draws
+    if not draws:
+        load_checked_job(path, until=[f"export-{name}"])
+        return
+    with pytest.raises(JobFileError, match=r"material\.ball\.look"):
+        load_checked_job(path, until=[f"export-{name}"])
 
 
 def test_gltf_says_that_it_has_no_zoom():

@@ -235,7 +235,7 @@ def test_a_recording_whose_process_was_killed_has_all_its_frames_again_once_it_i
     assert load_job(layout.job_file).frame_count == 1
     assert_told(activity(layout), "cut short", "3 frames", f"submitting {layout.job_file}")
     submitted = []
-    monkeypatch.setattr("pipeline.cli.make.run", lambda job, *_, **__: submitted.append(job.frame_count))
+    monkeypatch.setattr("pipeline.queue.submitting.run", lambda job, *_, **__: submitted.append(job.frame_count))
     ended = pipeline("submit", layout.job_file)
     assert ended.exit_code == 0, ended.output
     assert_told(ended.output, "drape-take was cut short", "3 frames")
