@@ -56,7 +56,7 @@ def new(name: Path, template: str) -> None:
 @until_option
 @click.option("--json", "as_json", is_flag=True, help="Print the whole job, defaults included, as JSON.")
 def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tuple[str, ...], as_json: bool) -> None:
-    """Say what is wrong with a job file, how large it is, and what it will take.
+    """Say what is wrong with a job file, its size, and what it will take.
 
     \b
     pipeline check my-film
@@ -199,7 +199,7 @@ def rerun(
     """
     from pipeline.job.loading import load_job
     from pipeline.run.control import Selection
-    from pipeline.run.goal import read_goal
+    from pipeline.run.goal import read_goal, write_goal
     from pipeline.run.plan import plan_job
     from pipeline.stages import STAGES
 
@@ -214,11 +214,16 @@ def rerun(
     submitted = load_job(layout.job_file)
     if submitted.recorded is not None and "simulate" in stages:
         raise PipelineError(f"{submitted.name} is a recording ({submitted.recorded}): it cannot be simulated again")
-    until = read_goal(layout)
+    before = read_goal(layout)
+    on_demand = [stage.name for stage in STAGES if stage.on_demand and stage.name in stages]
+    until = tuple(name if frames is None else f"{name}:{frames}" for name in on_demand) or before
     tasks = plan_job(submitted, layout, STAGES, until)
     selection.of(tasks)  # refuses now what is not in the plan, not when its turn comes
     todo = frozenset(task.stage for task in tasks)
-    sys.exit(run(submitted, layout, todo, options=options, rerun=selection, until=until))
+    code = run(submitted, layout, todo, options=options, rerun=selection, until=until)
+    if code == 0 and not options.detach:
+        write_goal(layout, before)
+    sys.exit(code)
 
 
 def _try_failed_again(job: str, output: Path, options: QueueOptions) -> int:

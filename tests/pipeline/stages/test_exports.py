@@ -16,6 +16,7 @@ from films import Studio
 from places import PROJECT
 
 from pipeline.job.loading import load_job
+from pipeline.run.goal import read_goal
 from pipeline.store.cache import read_frame
 from render.errors import InvalidFileError
 from render.gltf_files import read_glb
@@ -201,6 +202,10 @@ def test_usd_moves_bodies_and_names_volumes_by_relative_paths(usd):
     assert Path(file.resolvedPath).is_file()
     material, _ = UsdShade.MaterialBindingAPI(ball).ComputeBoundMaterial()
     assert material.ComputeSurfaceSource()[0].GetIdAttr().Get() == "UsdPreviewSurface"
+
+
+def test_after_an_export_what_is_asked_of_a_job_is_its_film_again(usd):
+    assert read_goal(usd.layout) == ()
 
 
 def test_the_same_usd_has_the_same_bytes(usd):
