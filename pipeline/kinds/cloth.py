@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
-from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.base.content import status_of, tool_version
-from pipeline.base.errors import MissingInputError
+from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.elements import count_nodes
 from pipeline.kinds.live_parameters import CLOTH_LIVE
 from pipeline.kinds.work import cloth_work
 from pipeline.model.job import Job
@@ -27,8 +25,6 @@ from render.spec import MeshSequenceObject, SceneObject
 from sim.cloth.materials import Material
 from sim.cloth.parameters import ClothParameters, RectangleSheet
 from sim.core.snapshots import Snapshot
-from sim.scene import SceneParameters
-from sim.shapes.parameters import MeshShape
 
 if TYPE_CHECKING:
     import h5py
@@ -46,34 +42,6 @@ LOOKS: dict[Material, MaterialParameters] = {
     "rubber": MaterialParameters(look="rubber", color=(0.03, 0.03, 0.035)),
 }
 """By what a cloth is made of."""
-
-
-def count_cloth_nodes(scene: SceneParameters) -> int:
-    """Number of nodes of all cloths; raises as `count_nodes`."""
-    return sum(count_nodes(cloth) for cloth in scene.cloth)
-
-
-def count_nodes(cloth: ClothParameters) -> int:
-    """Number of nodes; a mesh is read for it, once, as files of a size hold ten times as many or as few.
-
-    Raises MissingInputError: a mesh file cannot be read, or holds no sheet.
-    """
-    shape = cloth.shape
-    if isinstance(shape, RectangleSheet):
-        return prod(shape.node_counts)
-    status = status_of(shape.file, "mesh")
-    return _nodes_of_mesh(shape, status.st_size, status.st_mtime_ns)
-
-
-@cache
-def _nodes_of_mesh(shape: MeshShape, _size: int, _mtime_ns: int) -> int:
-    from sim.cloth.sheet import build_sheet
-    from sim.shapes.solid import ShapeError
-
-    try:
-        return len(build_sheet(shape).vertices)
-    except ShapeError as error:
-        raise MissingInputError(f"{error}; the job needs it") from error
 
 
 def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import ceil, inf, prod
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.elements import most_particles_of
 from pipeline.kinds.live_parameters import FLUID_LIVE
 from pipeline.kinds.work import fluid_work, mean_particles, surface_work
 from pipeline.model.job import Job
@@ -25,15 +26,10 @@ from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
 from render.surface import reconstruct_surface
 from sim.core.snapshots import Snapshot
 from sim.fluid.parameters import FluidParameters
-from sim.scene import SceneParameters
-from sim.shapes.parameters import BoxShape, Placement
+from sim.shapes.parameters import Placement
 
 if TYPE_CHECKING:
     import h5py
-
-
-MOST_IN_A_VOLUME = 1.5
-"""Particles of a thin block or a narrow opening, over what its volume holds: the last ones reach beyond it."""
 
 WETS_WITHIN_RADII = 1.5
 """How near a fluid's surface is to what it touches, in radii of its particles: up to 0.8 above moving ones."""
@@ -43,22 +39,6 @@ BYTES_PER_SURFACE_PARTICLE = 140_000
 """Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`."""
 CUBE_SIZE = 0.75
 """In radii. Cubes of half the width need four times the memory."""
-
-
-def most_particles(scene: SceneParameters) -> float:
-    """About the most particles of all fluids."""
-    return sum(most_particles_of(fluid, scene) for fluid in scene.fluid)
-
-
-def most_particles_of(fluid: FluidParameters, scene: SceneParameters, *, until_s: float = inf) -> float:
-    """About the most particles of a fluid: what blocks, and emitters until a time [s], give, at most a domain full."""
-    filled = sum(
-        prod(block.shape.size) * block.scale**3 if isinstance(block.shape, BoxShape) else inf for block in fluid.block
-    )
-    emitted = sum(emitter.emitted_volume(until_s) for emitter in fluid.emitter)
-    room = prod(high - low for low, high in zip(scene.domain.min, scene.domain.max, strict=True))
-    volume = min(MOST_IN_A_VOLUME * (filled + emitted), room)
-    return min(volume, fluid.most_volume) / fluid.lattice_volume
 
 
 def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.kinds.base import Work
 from pipeline.kinds.checks.steps import stable_dt
+from pipeline.kinds.elements import count_cloth_nodes, most_particles_of
 from pipeline.model.job import Job
 from sim.cloth.parameters import substeps_of
 from sim.fluid.expected_speed import expected_speed
@@ -82,8 +83,6 @@ def fewest_for_bodies(job: Job) -> int:
 
 def cloth_frame_s(job: Job, *, power: float) -> float:
     """Time that a frame of the cloths takes [s], on as many cores as `power`."""
-    from pipeline.kinds.cloth import count_cloth_nodes
-
     if not job.cloth:
         return 0.0
     substeps = max(substeps_of(job.cloth), fewest_for_bodies(job))
@@ -237,8 +236,6 @@ def rigid_work(job: Job, _elements: float, _on_gpu: bool) -> Work:
 
 def mean_particles(job: Job, particles: float) -> float:
     """Mean number of particles over a film at whose end there are so many: emitters fill it as it goes."""
-    from pipeline.kinds.fluid import most_particles_of
-
     most = sum(most_particles_of(fluid, job, until_s=job.film_s) for fluid in job.fluid)
     halfway = sum(most_particles_of(fluid, job, until_s=0.5 * job.film_s) for fluid in job.fluid)
     return particles * halfway / most if most else particles

@@ -13,7 +13,8 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.kinds.base import Work
-from pipeline.kinds.fluid import FLUID, most_particles
+from pipeline.kinds.elements import most_particles
+from pipeline.kinds.fluid import FLUID
 from pipeline.model.job import Job
 from pipeline.stages.base import FILE_S, FileWork, Stage, TaskContext
 from pipeline.stages.inputs import by_content

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 
 from pipeline.base.errors import PipelineError
-from pipeline.kinds.cloth import count_cloth_nodes
+from pipeline.kinds.elements import count_cloth_nodes
 from pipeline.kinds.live_parameters import Value
 from pipeline.kinds.table import KINDS
 from pipeline.kinds.work import cloth_frame_s, fewest_for_bodies, frame_s, steps_a_frame

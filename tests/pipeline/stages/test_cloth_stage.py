@@ -14,7 +14,8 @@ from pipeline.base.errors import MissingInputError
 from pipeline.base.layout import JobLayout
 from pipeline.job.inputs import keep_inputs
 from pipeline.job.loading import read_job
-from pipeline.kinds.cloth import CLOTH, count_cloth_nodes, count_nodes
+from pipeline.kinds.cloth import CLOTH
+from pipeline.kinds.elements import count_cloth_nodes, count_nodes
 from pipeline.kinds.table import material_of
 from pipeline.model.job import Job
 from pipeline.run.checked_job import load_checked_job
