@@ -326,6 +326,8 @@ class Teacher:
             usual = _seconds(work, files, cores, rates, on_gpu=on_gpu)
             if usual - work.start_s / rates.one_core < LEAST_TAUGHT_S:
                 continue
+            if 0.0 < work.work.shared_s < work.work.host_s:
+                continue  # tiny pictures and scenes are overhead, which says nothing of large ones
             if not rates.is_known(name):
                 seconds = max(0.2 * seconds, seconds - work.compiling_s / rates.one_core)
             written = disk.bytes_per_artifact(stage.name, size) * files

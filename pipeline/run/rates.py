@@ -31,7 +31,7 @@ ROUNDS_OF_REFERENCE = 2100.0
 """Rounds a second of the measurement on a core of the reference machine of `pipeline.kinds.work`."""
 _ELEMENTS = 1 << 18
 """Of each round: so many that threads seldom wait for the interpreter."""
-LARGEST_CORRECTION = 20.0
+LARGEST_CORRECTION = 4.0
 """A run that was so much slower or faster than expected was stopped, or something else was wrong with it."""
 NEWEST_WEIGHT = 0.3
 """Least weight of the newest run."""

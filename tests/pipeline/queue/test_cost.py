@@ -240,3 +240,23 @@ def test_a_small_run_teaches_nothing(tmp_path, monkeypatch):
     teacher.notify(Finished(TaskId("simulate"), 1, 60.0, 10**9))
     teacher.teach()
     assert known_rates() == REFERENCE
+
+
+def test_tiny_pictures_teach_nothing_of_large_ones(tmp_path, monkeypatch):
+    """They are overhead: a film after them was expected to take a tenth of its time."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    keep(REFERENCE)
+    job = drop(tmp_path, "render.resolution=[32,18]", "render.samples=1")
+    layout = JobLayout(tmp_path / "drop")
+    frame = layout.path(layout.frame_cache(0))
+    frame.parent.mkdir(parents=True)
+    water = Snapshot("fluid", {"position": np.zeros((50_000, 3), np.float32)}, {})
+    write_frame(frame, {"water": water}, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
+    teacher, tasks = Teacher(job, layout, TWO_CORES), planned(job)
+    teacher.notify(RunStarted(tasks))
+    for each in (each.task for each in tasks if each.task.stage == "render"):
+        receipt = Receipt(each.outputs[0], each.id, "render", 1, "", "", size=1000, mtime_ns=0, hash="")
+        teacher.notify(Committed(each.id, 1, receipt))
+        teacher.notify(Finished(each.id, 1, 0.2, 10**8))
+    teacher.teach()
+    assert known_rates() == REFERENCE
