@@ -118,19 +118,14 @@ def _export(
     from pipeline.job.loading import load_job
     from pipeline.queue.job_queue import Desired, JobQueue
     from pipeline.run.checked_job import read_own_job
-    from pipeline.run.goal import read_goal, write_goal
     from pipeline.show.handing_over import copy_export, refuse_if_busy, survey_export
     from pipeline.stages import STAGES
-    from pipeline.stages.export import PREFIX
 
     loaded = read_own_job(job_file, overrides, preview=preview, until=(end,))
     layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     waiting = JobQueue.of(layout).find(layout.root.absolute().name)
     refuse_if_busy(layout, None if waiting is None or waiting.desired is Desired.NONE else waiting.until)
-    before = tuple(goal for goal in read_goal(layout) if not goal.startswith(PREFIX))
     code = submit_to_queue(loaded, layout, options=options, until=(end,))
-    if code == 0 and not options.detach:
-        write_goal(layout, before)  # what is asked of the job later is about its film again
     if code or options.detach:
         if target is not None and not code:
             click.echo("what runs in the background is not copied; call again with -o when it is done", err=True)

@@ -199,7 +199,7 @@ def rerun(
     """
     from pipeline.job.loading import load_job
     from pipeline.run.control import Selection
-    from pipeline.run.goal import read_goal, write_goal
+    from pipeline.run.goal import read_goal
     from pipeline.run.plan import plan_job
     from pipeline.stages import STAGES
 
@@ -214,16 +214,12 @@ def rerun(
     submitted = load_job(layout.job_file)
     if submitted.recorded is not None and "simulate" in stages:
         raise PipelineError(f"{submitted.name} is a recording ({submitted.recorded}): it cannot be simulated again")
-    before = read_goal(layout)
     on_demand = [stage.name for stage in STAGES if stage.on_demand and stage.name in stages]
-    until = tuple(name if frames is None else f"{name}:{frames}" for name in on_demand) or before
+    until = tuple(name if frames is None else f"{name}:{frames}" for name in on_demand) or read_goal(layout)
     tasks = plan_job(submitted, layout, STAGES, until)
     selection.of(tasks)  # refuses now what is not in the plan, not when its turn comes
     todo = frozenset(task.stage for task in tasks)
-    code = run(submitted, layout, todo, options=options, rerun=selection, until=until)
-    if code == 0 and not options.detach:
-        write_goal(layout, before)
-    sys.exit(code)
+    sys.exit(run(submitted, layout, todo, options=options, rerun=selection, until=until))
 
 
 def _try_failed_again(job: str, output: Path, options: QueueOptions) -> int:

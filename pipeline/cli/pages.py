@@ -110,7 +110,7 @@ def live(
     pipeline live dam.toml --preview --port 0
     """
     from pipeline.base.resources import machine_capacity
-    from pipeline.run.checked_job import load_checked_job, read_own_job
+    from pipeline.run.checked_job import checked, read_own_job
     from pipeline.web.live.admission import computing_power, fluent, live_job, require_small, told_changes
     from pipeline.web.live.parameters import parameters_of
     from pipeline.web.live.soundness import LONGEST_FRAME_S
@@ -121,7 +121,7 @@ def live(
     require_pages()
     loaded = read_own_job(job_file, overrides, preview=preview)
     job = live_job(loaded.job, substeps=substeps)
-    loaded, findings = load_checked_job(job_file, overrides, preview=preview)
+    loaded, findings = checked(loaded)
     threads, on_gpu = cores or machine_capacity().cores, resolve_device(job.device) != "cpu"
     if not as_written and substeps is None:
         job = fluent(job, power=computing_power(cores=threads, on_gpu=on_gpu))

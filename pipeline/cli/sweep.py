@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
     from pipeline.job.sweep import Variant
     from pipeline.model.problems import Findings
+
+T = TypeVar("T")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -95,32 +99,38 @@ def _checked(
     job_file: Path, variants: list[Variant], output: Path, *, preview: bool, until: tuple[str, ...]
 ) -> list[_Planned]:
     """Every job, checked before any runs. Raises JobFileError with the problems of all of them, each once."""
-    from pipeline.job.loading import read_job
-    from pipeline.run.checked_job import load_checked_job, read_own_job, require_plannable
+    from pipeline.job.loading import load_job
+    from pipeline.run.checked_job import checked, read_own_job, require_plannable
 
-    problems: dict[str, None] = {}
-    planned: list[_Planned] = []
-    warnings: dict[str, None] = {}
-    base = None
-    for load in (False, True):  # what is wrong with keys and values is told in a moment, scenes take seconds
-        for variant in variants:
-            try:
-                if base is None:
-                    base = read_job(job_file).job.name
-                overrides = (*variant.overrides, f'name="{base[:39]}-{variant.suffix}"')
-                if not load:
-                    require_plannable(read_own_job(job_file, overrides, preview=preview, until=until))
-                    continue
-                loaded, findings = load_checked_job(job_file, overrides, preview=preview, until=until)
-            except JobFileError as error:
-                problems.update(dict.fromkeys(str(error).split("\n")))
-                continue
-            warnings.update(dict.fromkeys(loaded.warnings))
-            planned.append(_Planned(variant, loaded, findings, JobLayout(output / loaded.job.name)))
-        if problems:
-            raise JobFileError([*problems])
-    print_warnings([*warnings])
-    return planned
+    base = load_job(job_file).name
+
+    def read(variant: Variant) -> LoadedJob:
+        overrides = (*variant.overrides, f'name="{base[:39]}-{variant.suffix}"')
+        loaded = read_own_job(job_file, overrides, preview=preview, until=until)
+        require_plannable(loaded)
+        return loaded
+
+    # What is wrong with keys and values is told in a moment, scenes take seconds.
+    read_jobs = _of_all(read, variants)
+    found = _of_all(lambda loaded: checked(loaded, until), read_jobs)
+    print_warnings([*dict.fromkeys(warning for loaded, _ in found for warning in loaded.warnings)])
+    return [
+        _Planned(variant, loaded, findings, JobLayout(output / loaded.job.name))
+        for variant, (loaded, findings) in zip(variants, found, strict=True)
+    ]
+
+
+def _of_all(act: Callable[[T], Result], each: Sequence[T]) -> list[Result]:
+    """What `act` returns of each. Raises JobFileError with the problems of all of them, each once."""
+    results, problems = [], dict[str, None]()
+    for one in each:
+        try:
+            results.append(act(one))
+        except JobFileError as error:
+            problems.update(dict.fromkeys(error.problems))
+    if problems:
+        raise JobFileError([*problems])
+    return results
 
 
 def _say_cost(planned: list[_Planned], until: tuple[str, ...], options: QueueOptions) -> None:

@@ -74,11 +74,6 @@ def bodies(job: SceneParameters) -> Iterator[tuple[KeyPath, Kind, Any]]:
             yield (kind.name, index), kind, body
 
 
-def body_names(job: SceneParameters) -> list[str]:
-    """Names of all bodies."""
-    return [body.name for _, _, body in bodies(job)]
-
-
 def world_of(job: Job) -> World:
     """The world of a job in its initial state, with the solvers of all kinds; as of `sim.build.build_world`."""
     from sim.build import build_world

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from pipeline.base import wording
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
-from pipeline.base.resources import claim, machine_capacity
+from pipeline.base.resources import machine_capacity
 from pipeline.base.task import FailureKind, Resources, Task, TaskId
 from pipeline.kinds.table import KINDS
 from pipeline.model.gpus import gpu_count
@@ -169,9 +169,8 @@ def _of_stages(
             continue  # nothing computes a recording's frames
         first = theirs[0].task
         on_gpu = first.resources.gpus > 0 and not without_gpu
-        need = first.resources if on_gpu else Resources(_cpu_cores(first), first.resources.memory_bytes)
         gpus = max(1, costs.capacity.gpus)
-        taken = claim(need, Resources(costs.capacity.cores, costs.capacity.memory_bytes, gpus))
+        cores = _cores_of(first, costs.capacity, on_gpu=on_gpu)
         work = stage.work(job, size.elements, on_gpu=on_gpu)
         name = work_name(stage.name, work, on_gpu=on_gpu)
         files = sum(len(each.rebuilds) for each in theirs)
@@ -181,10 +180,10 @@ def _of_stages(
         if cost is not None and cost.seconds_per_artifact > 0.0:
             seconds = files * cost.seconds_per_artifact
         else:
-            seconds = factors.time * _seconds(work, files, taken.cores, costs.rates, on_gpu=on_gpu)
+            seconds = factors.time * _seconds(work, files, cores, costs.rates, on_gpu=on_gpu)
             if not costs.rates.is_known(name):
                 seconds += work.compiling_s / costs.rates.one_core
-        at_once = max(1, min(len(theirs), gpus if on_gpu else costs.capacity.cores // max(1, taken.cores)))
+        at_once = max(1, min(len(theirs), gpus if on_gpu else costs.capacity.cores // max(1, cores)))
         memory = (work.memory_bytes or float(first.resources.memory_bytes)) * factors.memory
         yield StageExpectation(
             stage=stage.name,
@@ -194,7 +193,7 @@ def _of_stages(
             memory_bytes=at_once * memory,
             is_measured=cost is not None or costs.rates.is_known(name),
             on_gpu=on_gpu,
-            occupies_s=seconds / gpus if on_gpu else seconds * taken.cores / costs.capacity.cores,
+            occupies_s=seconds / gpus if on_gpu else seconds * cores / costs.capacity.cores,
             longest_s=seconds if _is_chain(theirs) else 0.0,
         )
 
@@ -210,9 +209,10 @@ def _seconds(work: FileWork, files: int, cores: int, rates: MachineRates, *, on_
     return work.start_s / rates.one_core + files * (shared + work.work.host_s / rates.one_core)
 
 
-def _cpu_cores(task: Task) -> int:
-    """Cores that a task claims where there is no GPU for it: a long one all of them."""
-    return 0 if task.checkpointed else task.resources.cores
+def _cores_of(task: Task, capacity: Resources, *, on_gpu: bool) -> int:
+    """Cores that a task takes: a long one all of them where there is no GPU for it."""
+    asked = 0 if task.checkpointed and not on_gpu else task.resources.cores
+    return min(asked or capacity.cores, capacity.cores)
 
 
 def _current_stages(assessments: Iterable[Assessment]) -> frozenset[str]:
@@ -320,7 +320,7 @@ class Teacher:
                 continue
             first = ended[0]
             on_gpu = first.resources.gpus > 0
-            cores = claim(without_gpus(first.resources), self._costs.capacity).cores
+            cores = _cores_of(first, self._costs.capacity, on_gpu=on_gpu)
             work = stage.work(self._job, size.elements, on_gpu=on_gpu)
             name = work_name(stage.name, work, on_gpu=on_gpu)
             usual = _seconds(work, files, cores, rates, on_gpu=on_gpu)
@@ -340,8 +340,3 @@ class Teacher:
                 memory=peak / memory if memory else 0.0,
             )
         return rates
-
-
-def without_gpus(resources: Resources) -> Resources:
-    """The same without GPUs."""
-    return Resources(resources.cores, resources.memory_bytes)

@@ -26,6 +26,7 @@ from pipeline.run.control import RunControl, Selection
 from pipeline.run.events import JobOutcome, Observer, Outcome
 from pipeline.run.executors.attempt import STAGES_REFERENCE
 from pipeline.run.executors.choice import ExecutorChoice, open_machines
+from pipeline.run.goal import own_goal, return_to
 from pipeline.run.progress import ProgressObserver, open_display
 from pipeline.run.rates import known_rates
 from pipeline.run.runner import run_job
@@ -101,6 +102,7 @@ class Turns:
         self._queue = queue
         self._submission = submission
         self._job: Job | None = None
+        self._own_goal: tuple[str, ...] = ()
         self._aside = False
 
     def run(self, entry: QueuedJob, control: FarmControl, observer: TakeOver) -> Outcome:
@@ -111,6 +113,7 @@ class Turns:
         if self._aside:
             say(f"{entry.name}: its turn")
         job = load_job(layout.job_file) if entry.text is None else job_of_text(entry.text, layout.job_file)
+        self._own_goal = own_goal(layout)
         outcome = _run_once(job, layout, entry, control=control, observer=observer.notify)
         self._job = job
         return outcome
@@ -119,7 +122,7 @@ class Turns:
         """Say how a turn ended, here and to those who want to be told."""
         if ended.outcome is not None and self._job is not None:
             try:
-                tell_end(self._job, as_given(JobLayout(folder)), ended.outcome, aside=self._aside)
+                _end(self._job, as_given(JobLayout(folder)), ended.outcome, self._own_goal, aside=self._aside)
             except (OSError, PipelineError) as error:  # of its folder: the other jobs go on
                 print_warnings([f"{name}: {error}"])
         notification = notification_of(name, folder, ended)
@@ -139,17 +142,25 @@ def run_now(queue: JobQueue, layout: JobLayout, job: Job, entry: QueuedJob) -> i
 
     Returns the exit code; None if somebody else works in its folder now.
     """
+    before = own_goal(layout)
     try:
         outcome = _run_once(job, layout, replace(entry, settings=()))  # no cluster is needed for nothing
     except JobBusyError:
         return None
-    tell_end(job, layout, outcome)
+    _end(job, layout, outcome, before)
     if outcome.kind is JobOutcome.SUCCEEDED and queue.folder.exists():
         with queue.locked(), suppress(QueueError):
             old = queue.find(entry.name)
             if old is not None and old.desired is not Desired.RUN:
                 queue.drop(entry.name)
     return outcome.exit_code
+
+
+def _end(job: Job, layout: JobLayout, outcome: Outcome, own_goal: tuple[str, ...], *, aside: bool = False) -> None:
+    """Tell the end of a run; after an export what is asked of the job is about its own goal again."""
+    tell_end(job, layout, outcome, aside=aside)
+    if outcome.kind is JobOutcome.SUCCEEDED:
+        return_to(layout, own_goal)
 
 
 def _run_once(

@@ -65,7 +65,9 @@ def _check_limits(job: Job, findings: Findings) -> None:
             )
 
 
-def read_own_job(path: Path | str, overrides: Sequence[str], *, preview: bool, until: Sequence[str] = ()) -> LoadedJob:
+def read_own_job(
+    path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False, until: Sequence[str] = ()
+) -> LoadedJob:
     """A job file that names no program but the user's own.
 
     Raises JobFileError with every problem; if keys or values are wrong, with those of the scene that is left, too.
@@ -73,7 +75,7 @@ def read_own_job(path: Path | str, overrides: Sequence[str], *, preview: bool, u
     try:
         loaded = read_job(path, overrides, preview=preview)
     except InvalidJobError as error:
-        raise with_findings(error, until) from None
+        raise _with_findings(error, until) from None
     require_own_programs(loaded, overrides)
     return loaded
 
@@ -104,17 +106,6 @@ def require_plannable(loaded: LoadedJob) -> None:
         raise JobFileError(loaded.source.describe_all(findings.errors))
 
 
-def load_checked_job(
-    path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False, until: Sequence[str] = ()
-) -> tuple[LoadedJob, Findings]:
-    """Read a job file and look at the whole job; its warnings are in place. Raises JobFileError with every problem."""
-    try:
-        loaded = read_job(path, overrides, preview=preview)
-    except InvalidJobError as error:
-        raise with_findings(error, until) from None
-    return checked(loaded, until)
-
-
 def checked(loaded: LoadedJob, until: Sequence[str] = ()) -> tuple[LoadedJob, Findings]:
     """A job that was read, with its warnings, and what was found of it. Raises JobFileError with every problem."""
     findings = check_job(loaded.job, until=until)
@@ -123,7 +114,7 @@ def checked(loaded: LoadedJob, until: Sequence[str] = ()) -> tuple[LoadedJob, Fi
     return replace(loaded, warnings=tuple(loaded.source.describe_all(findings.warnings))), findings
 
 
-def with_findings(error: InvalidJobError, until: Sequence[str] = ()) -> JobFileError:
+def _with_findings(error: InvalidJobError, until: Sequence[str]) -> JobFileError:
     """The error with the problems of the scene that the rest of the file describes."""
     job, standing = error.standing_job(), error.standing
     if job is None:

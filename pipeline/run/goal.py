@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from pipeline.base.files import replace_durably
 from pipeline.base.layout import JobLayout
+from pipeline.stages import STAGES
 
 
 def read_goal(layout: JobLayout) -> tuple[str, ...]:
@@ -27,6 +28,18 @@ def write_goal(layout: JobLayout, until: Sequence[str]) -> None:
         replace_durably(layout.goal, json.dumps({"until": [*until]}) + "\n")
     else:
         layout.goal.unlink(missing_ok=True)
+
+
+def own_goal(layout: JobLayout) -> tuple[str, ...]:
+    """The goal but for exports, which are made beside it."""
+    on_demand = {stage.name for stage in STAGES if stage.on_demand}
+    return tuple(end for end in read_goal(layout) if end.partition(":")[0] not in on_demand)
+
+
+def return_to(layout: JobLayout, before: Sequence[str]) -> None:
+    """After an export is made, let what is asked of the job be about its own goal again, as it was before."""
+    if read_goal(layout) != own_goal(layout):
+        write_goal(layout, before)
 
 
 def what_is_made(layout: JobLayout) -> str:

@@ -17,7 +17,7 @@ from pipeline.stages.render_scene import camera_path, framed_points, view_at
 from pipeline.store.cache import read_frame
 from render.camera_path import View
 from render.poses import Placement
-from render.spec import MovingMeshObject, RenderSpec
+from render.spec import MovingMeshObject, RenderSpec, VolumeSequenceObject
 from sim.rigid.parameters import RigidBodyParameters
 
 PREFIX = "export-"  # begins the names of these stages; that of the format follows
@@ -64,6 +64,11 @@ class ExportStage(Stage):
         if self.of_one_range and len(frames) != frames[-1] - frames[0] + 1:
             raise PlanError(f"{self.format} plays every frame from its first to its last; name one range, like 10-40")
         return list(frames)
+
+    def require_meshes(self, spec: RenderSpec, name: str) -> None:
+        """Raises PlanError: nothing of a job has a place in a format, called by this name, that has no volumes."""
+        if all(isinstance(each, VolumeSequenceObject) for each in spec.objects):
+            raise PlanError(f"the job has only smoke, and {name} has no volumes; use --to usd or --to blend")
 
     def left_out(self, job: Job) -> list[str]:  # noqa: ARG002
         """What of a job the format has no place for, in words."""

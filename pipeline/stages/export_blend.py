@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
-from pipeline.base.errors import PlanError
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
@@ -18,10 +17,10 @@ from pipeline.stages.export import ExportStage, meshes_of
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render import CORES, WORKER_BYTES, RenderStage, decisive
 from pipeline.stages.render_drawing import FrameDrawing
-from pipeline.stages.render_scene import framed_points, render_spec, write_motion
+from pipeline.stages.render_scene import framed_points, framing_files, render_spec, write_motion
 from render.blend_file import validate_alembic, validate_scene_file, write_scene_file
 from render.meshes import validate_ply
-from render.spec import MeshSequenceObject, RenderSpec, SceneObject, VolumeSequenceObject
+from render.spec import MeshSequenceObject, RenderSpec, SceneObject
 from render.temporary_folder import temporary_folder
 
 FOLDER = "blend"
@@ -48,7 +47,7 @@ class _SceneExport(ExportStage):
         return Task(
             id=TaskId(f"{self.name}/scene"),
             stage=self.name,
-            inputs=(*read, *cached, *meshes, *_film_bounds(job, layout)),
+            inputs=(*read, *cached, *meshes, *framing_files(job, layout)),
             outputs=(self.root(job),),
             parameters=ParameterSet.of(
                 stage=self.name,
@@ -105,7 +104,7 @@ class BlendExport(_SceneExport):
                     *meshes,
                     *_played(job, layout, frame, volumes=False),
                     *([layout.frame_cache(frame)] if job.moving_bodies else ()),
-                    *_film_bounds(job, layout),
+                    *framing_files(job, layout),
                 ),
                 outputs=tuple(JobLayout.product(FOLDER, name, frame, ".ply") for name in fluids),
                 parameters=parameters,
@@ -147,8 +146,7 @@ class AbcExport(_SceneExport):
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task."""
-        if all(isinstance(each, VolumeSequenceObject) for each in render_spec(job, layout).objects):
-            raise PlanError(f"{job.name} has only smoke, and Alembic has no volumes; use --to usd or --to blend")
+        self.require_meshes(render_spec(job, layout), "Alembic")
         read = [path for frame in self.chosen(job) for path in _played(job, layout, frame, volumes=True)]
         return [self._scene_task(job, layout, read)]
 
@@ -166,10 +164,6 @@ def _played(job: Job, layout: JobLayout, frame: int, *, volumes: bool) -> list[A
     """Files of a frame that the scene plays."""
     products = [path for _, _, path in products_of(job, layout, frame) if volumes or not path.endswith(".vdb")]
     return [*products, *(layout.whitewater(fluid, frame) for fluid in job.whitewater)]
-
-
-def _film_bounds(job: Job, layout: JobLayout) -> list[ArtifactPath]:
-    return [layout.film_bounds()] if job.camera.frames_action else []
 
 
 def _wet(objects: Iterable[SceneObject]) -> list[str]:

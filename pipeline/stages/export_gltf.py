@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
-from pipeline.base.errors import PipelineError, PlanError
+from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
@@ -13,10 +13,10 @@ from pipeline.kinds.table import products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, meshes_of, motion
-from pipeline.stages.render_scene import framed_points, render_spec
+from pipeline.stages.render_scene import framed_points, framing_files, render_spec
 from render.gltf_files import TooLargeError, validate_glb, write_glb
 from render.meshes import SurfaceMesh, read_ply
-from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, PointSequenceObject, VolumeSequenceObject
+from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject
 
 LIMIT_BYTES = 100_000_000
 """What somebody may still wait for who opens a page."""
@@ -47,8 +47,7 @@ class GltfExport(ExportStage):
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task."""
         spec, frames = render_spec(job, layout), self.chosen(job)
-        if all(isinstance(each, VolumeSequenceObject | PointSequenceObject) for each in spec.objects):
-            raise PlanError(f"{job.name} has only smoke, and glTF has no volumes; use --to usd or --to blend")
+        self.require_meshes(spec, "glTF")
         played = [path for frame in frames for _, _, path in products_of(job, layout, frame)]
         poses = [layout.frame_cache(frame) for frame in frames] if job.moving_bodies or job.placed_camera.moves else []
         scene = Task(
@@ -58,7 +57,7 @@ class GltfExport(ExportStage):
                 *(path for path in played if not path.endswith(".vdb")),
                 *poses,
                 *(mesh for _, _, mesh in meshes_of(job)),
-                *([layout.film_bounds()] if job.camera.frames_action else ()),
+                *framing_files(job, layout),
             ),
             outputs=(self.root(job),),
             parameters=ParameterSet.of(

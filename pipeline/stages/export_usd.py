@@ -13,7 +13,7 @@ from pipeline.kinds.table import bodies, drawn_bodies, material_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, frame_of, meshes_of, motion
-from pipeline.stages.render_scene import framed_points, render_spec
+from pipeline.stages.render_scene import framed_points, framing_files, render_spec
 from pipeline.store.cache import read_compact
 from render.meshes import read_ply
 from render.point_clouds import KINDS, drawn_radii, read_point_cloud
@@ -68,7 +68,7 @@ class UsdExport(ExportStage):
                 *poses,
                 *(mesh for _, _, mesh in meshes_of(job)),
                 *(layout.product("cloths", cloth.name, frames[0], ".ply") for cloth in job.cloth),
-                *([layout.film_bounds()] if job.camera.frames_action else ()),
+                *framing_files(job, layout),
             ),
             outputs=(MANIFEST, self.root(job)),
             parameters=ParameterSet.of(

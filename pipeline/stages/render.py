@@ -21,7 +21,7 @@ from pipeline.model.problems import suggestion
 from pipeline.stages.base import FileWork, Stage, TaskContext
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render_drawing import CPU, FrameDrawing, close_renderers, may_be_empty
-from pipeline.stages.render_scene import render_spec, write_motion
+from pipeline.stages.render_scene import framing_files, render_spec, write_motion
 from pipeline.stages.texture_memory import own_picture_bytes
 from pipeline.stages.visibility import bodies_at, warn_if_invisible
 from render.blend_file import read_material_names
@@ -94,8 +94,7 @@ class RenderStage(Stage):
             gpus=int(_draws_on_gpus(job)),
         )
         static = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
-        if job.camera.frames_action:
-            static.append(layout.film_bounds())
+        static += framing_files(job, layout)
         return [
             Task(
                 id=TaskId(f"render/{frame:06d}"),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath
 from pipeline.kinds.table import scene_objects
 from pipeline.model.job import Job
 from pipeline.stages.bounds import read_framed
@@ -45,6 +46,11 @@ def camera_path(job: Job, framed: NDArray[np.float64] | None = None) -> CameraPa
     return CameraPath(
         job.placed_camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts, framed=framed
     )
+
+
+def framing_files(job: Job, layout: JobLayout) -> list[ArtifactPath]:
+    """The file that says what the camera frames, where it frames the action."""
+    return [layout.film_bounds()] if job.camera.frames_action else []
 
 
 def framed_points(job: Job, layout: JobLayout) -> NDArray[np.float64] | None:

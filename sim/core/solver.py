@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -100,7 +101,7 @@ class TakesPushes(HasViews, Protocol):
         """Change the velocity of what is free to move, in the order of `view`, by (n, 3) or (3,) [m/s]."""
 
 
-class Coupling:
+class Coupling(Protocol):
     """Exchanges momentum between two solvers; one that works one way only has nothing to do in `follow` and `resume`.
 
     Attributes:
@@ -112,9 +113,9 @@ class Coupling:
     bodies: tuple[str, str]
     is_loose = False
 
+    @abstractmethod
     def exchange(self, dt: float) -> None:
         """Right before the second's step of dt [s], which the first has made: hand the impulses of the first to it."""
-        raise NotImplementedError
 
     def follow(self, dt: float) -> None:
         """After both have made a step of dt [s]: tell the first where the second is now."""

@@ -1,12 +1,14 @@
 """What `check` tells of the text of a job."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.job.loading import read_job
+from pipeline.job.loading import LoadedJob, read_job
 from pipeline.model.problems import Findings
-from pipeline.run.checked_job import check_job
+from pipeline.run import checked_job
+from pipeline.run.checked_job import check_job, read_own_job
 
 PLUME_FROM_A_BALL = """
 name = "air"
@@ -69,3 +71,10 @@ def checked(text: str, path: Path, *, memory_bytes: int | None = None) -> Checke
     findings = check_job(loaded.job, memory_bytes=memory_bytes)
     describe = loaded.source.describe_all
     return Checked(describe(findings.errors), describe(findings.warnings), findings)
+
+
+def load_checked_job(
+    path: Path, overrides: Sequence[str] = (), *, preview: bool = False, until: Sequence[str] = ()
+) -> tuple[LoadedJob, Findings]:
+    """Read and check a job as the commands do. Raises JobFileError with every problem."""
+    return checked_job.checked(read_own_job(path, overrides, preview=preview, until=until), until)

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from checked_jobs import load_checked_job
 from places import PROJECT
 
 from pipeline.job.loading import load_job
 from pipeline.job.reference import reference, with_reference
 from pipeline.job.schema import job_schema, node_at
-from pipeline.run.checked_job import load_checked_job
 from sim.cloth.materials import MATERIALS
 
 

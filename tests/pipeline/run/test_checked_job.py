@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import pytest
+from checked_jobs import load_checked_job
 
 from pipeline.base.errors import JobFileError
-from pipeline.run.checked_job import load_checked_job
 
 SIX_FAULTS = """name = "six"
 duration = 2.0

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from checked_jobs import load_checked_job
 from executor_contract import PATIENCE_S, assert_gone, assign, events_until_end, failure, layout, run
 from memory_group import memory_group
 from places import HELPERS
@@ -26,7 +27,6 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import FailureKind, Resources, TaskId, TaskState
 from pipeline.job.loading import load_job
 from pipeline.record.reader import ManifestReader
-from pipeline.run.checked_job import load_checked_job
 from pipeline.run.events import Failed, JobOutcome
 from pipeline.run.executors import worker_process
 from pipeline.run.executors.failures import classify

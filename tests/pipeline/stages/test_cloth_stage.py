@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from checked_jobs import load_checked_job
 from inline_tasks import run_task
 from planned_jobs import LAYOUT, concerned, digests, first_of, planned
 
@@ -18,7 +19,6 @@ from pipeline.kinds.cloth import CLOTH
 from pipeline.kinds.elements import count_cloth_nodes, count_nodes
 from pipeline.kinds.table import material_of
 from pipeline.model.job import Job
-from pipeline.run.checked_job import load_checked_job
 from pipeline.run.events import Finished
 from pipeline.stages.product import ProductStage
 from pipeline.stages.render_scene import render_spec

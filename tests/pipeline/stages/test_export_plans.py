@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from checked_jobs import load_checked_job
 from planned_jobs import LAYOUT
 
 from pipeline.base.errors import JobFileError, PipelineError, PlanError
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import job_of_text
-from pipeline.run.checked_job import load_checked_job, needs_pictures
+from pipeline.run.checked_job import needs_pictures
 from pipeline.run.plan import plan_job
 from pipeline.show.handing_over import refuse_if_busy
 from pipeline.stages import EXPORTS, STAGES

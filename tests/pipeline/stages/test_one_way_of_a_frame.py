@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from blender_scenes import sphere, write_mesh
+from checked_jobs import load_checked_job
 from inline_tasks import run_task
 from PIL import Image
 
@@ -17,7 +18,6 @@ from pipeline.base.layout import JobLayout
 from pipeline.job import loading
 from pipeline.job.loading import load_job, read_job
 from pipeline.model.job import Job
-from pipeline.run.checked_job import load_checked_job
 from pipeline.run.events import Finished
 from pipeline.stages import render_drawing
 from pipeline.stages.render import RenderStage

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from checked_jobs import BALL, PLUME, WATER, checked, says
+from checked_jobs import BALL, PLUME, WATER, checked, load_checked_job, says
 
 from pipeline.base.errors import JobFileError
 from pipeline.job.loading import job_of_text, read_job
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.starter import TEMPLATES, starter
 from pipeline.model.problems import Findings
-from pipeline.run.checked_job import check_job, load_checked_job
+from pipeline.run.checked_job import check_job
 
 HEAD = 'name = "dam"\nframes = 10\n'
 
@@ -58,7 +58,8 @@ def test_starter_passes_every_check_without_a_warning(template, preview, tmp_pat
         (PLUME.replace("0.05", "0.4"), "6 smoke[0].cell_size: 0.4 m ... fewer than 4 cells ... of 1 m; use 0.25 m"),
     ],
 )
-def test_job_that_cannot_be_meant_is_refused_at_its_place(text, expected, tmp_path):
+def test_job_that_cannot_be_meant_is_refused_at_its_place(text, expected, tmp_path, monkeypatch):
+    monkeypatch.setenv("PIPELINE_BLENDER", "/nowhere/blender")  # the user's own choice, which a file may name
     errors = checked(HEAD + text, tmp_path / "dam.toml").errors
     assert any(says(error, f"dam.toml:{expected}") for error in errors), errors
     with pytest.raises(JobFileError) as refused:

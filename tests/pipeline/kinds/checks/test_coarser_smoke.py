@@ -2,10 +2,9 @@
 
 import pytest
 import trimesh
-from checked_jobs import PLUME_FROM_A_BALL
+from checked_jobs import PLUME_FROM_A_BALL, load_checked_job
 
 from pipeline.base.errors import JobFileError
-from pipeline.run.checked_job import load_checked_job
 
 PLUME = PLUME_FROM_A_BALL.replace(
     '{ type = "sphere", radius = 0.1 }', '{ type = "cylinder", radius = 0.1, height = 0.1 }'

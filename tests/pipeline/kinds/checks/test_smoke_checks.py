@@ -3,14 +3,13 @@
 import re
 
 import pytest
-from checked_jobs import BALL, PLUME, checked, says
+from checked_jobs import BALL, PLUME, checked, load_checked_job, says
 
 from pipeline.job.loading import read_job
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.smoke import check_smokes
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
-from pipeline.run.checked_job import load_checked_job
 
 HEAD = 'name = "fire"\nframes = 60\n'
 SMOKE, SOURCE = (PLUME[: PLUME.index("[[smoke.s")], "\n" + PLUME[PLUME.index("[[smoke.s") :])

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked_jobs import load_checked_job
 from command_line import pipeline
 from live_jobs import BALL_OVER_SHEET, live, loaded, recording
 
@@ -21,7 +22,6 @@ from pipeline.job.loading import load_job, read_job
 from pipeline.queue.changes import continuation
 from pipeline.queue.job_queue import JobQueue
 from pipeline.record.interrupted_recording import complete_interrupted_recording, frames_of_interrupted_recording
-from pipeline.run.checked_job import load_checked_job
 from pipeline.run.single_stage import StageOutcome, run_stage
 from pipeline.store.cache import read_frame
 from pipeline.web.dashboard.actions import Queue, actions_of
