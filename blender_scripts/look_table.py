@@ -32,6 +32,7 @@ class LookRow:
         keys: keys of a material that have an effect on it, beside `color`, which has one on every look.
         swims_on: kinds of these bodies that have nothing for its texture to hang on.
         paints_parts: parts of a body in this look keep their own materials; other looks are of one piece.
+        fits_sheets: whether its texture is scaled by the size of a cloth.
         paves: whether the ground of a set can have it.
         revision: raised when the same keys give other pixels.
     """
@@ -40,6 +41,7 @@ class LookRow:
     keys: tuple[str, ...] = ()
     swims_on: tuple[str, ...] = ()
     paints_parts: bool = False
+    fits_sheets: bool = False
     paves: bool = False
     revision: int = 1
 
@@ -63,16 +65,16 @@ LOOK_TABLE: dict[str, LookRow] = {
     "rubber": LookRow(SURFACES, ("roughness",), paints_parts=True, paves=True),
     "ceramic": LookRow(SURFACES, ("roughness",), paints_parts=True, paves=True),
     "plastic": LookRow(SURFACES, ("roughness",), paints_parts=True, paves=True),
-    "metal": LookRow(SURFACES, ("roughness",), paves=True),
-    "stone": LookRow(SURFACES, ("roughness",), swims_on=("fluid", "cloth"), paves=True),
-    "wood": LookRow(SURFACES, ("roughness",), swims_on=("fluid",), paves=True),
+    "metal": LookRow(SURFACES, ("roughness",), paves=True, revision=2),
+    "stone": LookRow(SURFACES, ("roughness",), swims_on=("fluid", "cloth"), fits_sheets=True, paves=True, revision=2),
+    "wood": LookRow(SURFACES, ("roughness",), swims_on=("fluid",), fits_sheets=True, paves=True, revision=2),
     "glass": LookRow(SURFACES, ("roughness", "caustics")),
     "spray": LookRow(SURFACES, ("roughness",)),
     "foam": LookRow(SURFACES),
     "bubbles": LookRow(SURFACES, ("roughness",)),
-    "cotton": LookRow(CLOTHS, ("roughness", "thread_spacing"), revision=2),
-    "silk": LookRow(CLOTHS, ("roughness", "thread_spacing"), revision=2),
-    "denim": LookRow(CLOTHS, ("roughness", "thread_spacing"), revision=2),
+    "cotton": LookRow(CLOTHS, ("roughness", "thread_spacing"), revision=3),
+    "silk": LookRow(CLOTHS, ("roughness", "thread_spacing"), revision=3),
+    "denim": LookRow(CLOTHS, ("roughness", "thread_spacing"), revision=3),
     "tank_glass": LookRow(NOTHING, ("roughness",)),
     "tank_edge": LookRow(NOTHING, ("roughness",)),
 }

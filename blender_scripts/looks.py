@@ -13,27 +13,18 @@ import bpy
 
 from blender_scripts import smoke_looks, weaves, wood  # noqa: F401 - they register their looks
 from blender_scripts.geometry import WET
+from blender_scripts.optics import per_metre
 from blender_scripts.shading import LOOKS, Color, LookContext, NodeBuilder, draws, or_default
 
 WATER_IOR = 1.333
-WATER_ABSORPTION_PER_M: Color = (0.30, 0.055, 0.009)
-"""Of pure water for red, green and blue light [1/m] (Pope & Fry 1997, rounded)."""
-_WATER_ABSORPTION_BY_SIZE = 7.0  # a domain this many metres across needs no exaggeration to look like deep water
 
 HONEY_IOR = 1.49  # of honey with 18 % water (Chataway's table has 1.4915 at 20 °C)
-HONEY_TINT: Color = (0.80, 0.59, 0.045)
-"""What a centimetre of honey makes of white light: an amber between clover's and heather's, chosen by eye."""
 HONEY_SCATTERING_PER_M = 40.0
 HONEY_ANISOTROPY = 0.8
 """Pollen, wax and fine crystals scatter forwards, chosen by eye: without them a thin stream in a dark room is olive."""
-_HONEY_SIZE = 0.075  # a domain this many metres across needs no thinner honey: larger ones would look like tar
 
 MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
 """Diffuse reflectance of whole milk for red, green and blue light [-] (Jensen et al. 2001, fig. 5)."""
-MILK_PATH_M: Color = (10.9e-3, 6.6e-3, 2.5e-3)
-"""How far light spreads in whole milk [m]: 1 / sqrt(3 a (a + s)) with the absorption a = (0.0011, 0.0024, 0.014)/mm
-and the reduced scattering s = (2.55, 3.21, 3.77)/mm (Jensen et al. 2001, fig. 5)."""
-_MILK_SIZE = 0.5  # a domain this many metres across needs no exaggeration to look like milk, and not like plaster
 
 
 def new_material(name: str, look: str, context: LookContext) -> Any:
@@ -47,10 +38,7 @@ def new_material(name: str, look: str, context: LookContext) -> Any:
 def _water(builder: NodeBuilder, context: LookContext) -> None:
     """Clear water that absorbs red first, and lets light through to what lies under it."""
     _clear_surface(builder, context, ior=WATER_IOR, tint=(0.94, 0.975, 1.0))
-    # Given explicitly, the factor is on the real absorption; by default a small tank is as blue as a deep pool.
-    factor = or_default(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
-    coefficients = WATER_ABSORPTION_PER_M if context.color is None else _absorption_of_tint(context.color)
-    builder.volume(_homogeneous_absorption(builder, tuple(factor * value for value in coefficients)))
+    builder.volume(_homogeneous_absorption(builder, per_metre("water", context.inner_density, context.color)))
 
 
 def _clear_surface(
@@ -71,17 +59,15 @@ def _clear_surface(
 def _honey(builder: NodeBuilder, context: LookContext) -> None:
     """Amber that absorbs blue first, a little cloudy."""
     _clear_surface(builder, context, ior=HONEY_IOR, tint=(1.0, 0.97, 0.9))
-    factor = or_default(context.density, _HONEY_SIZE / context.domain_size)
-    tint = or_default(context.color, HONEY_TINT)
-    per_metre = tuple(-100.0 * factor * math.log(min(max(channel, 1e-3), 0.999)) for channel in tint)
+    absorption = per_metre("honey", context.inner_density, context.color)
     scattering = builder.node(
         "ShaderNodeVolumeScatter",
         Color=(1.0, 1.0, 1.0),
-        Density=HONEY_SCATTERING_PER_M * factor,
+        Density=HONEY_SCATTERING_PER_M * context.inner_density,
         Anisotropy=HONEY_ANISOTROPY,
     )
     both = builder.node("ShaderNodeAddShader")
-    for shader, socket in zip((_homogeneous_absorption(builder, per_metre), scattering), both.inputs, strict=True):
+    for shader, socket in zip((_homogeneous_absorption(builder, absorption), scattering), both.inputs, strict=True):
         builder.link(shader.outputs[0], socket)
     builder.volume(both)
 
@@ -89,7 +75,6 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
 @draws("milk")
 def _milk(builder: NodeBuilder, context: LookContext) -> None:
     """White that light enters and leaves elsewhere, red the farthest, under a wet surface."""
-    factor = or_default(context.density, _MILK_SIZE / context.domain_size)
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
         Base_Color=or_default(context.color, MILK_REFLECTANCE),
@@ -97,7 +82,7 @@ def _milk(builder: NodeBuilder, context: LookContext) -> None:
         IOR=1.35,
         Subsurface_Weight=1.0,
         Subsurface_Scale=1.0,
-        Subsurface_Radius=tuple(length / factor for length in MILK_PATH_M),
+        Subsurface_Radius=tuple(1.0 / each for each in per_metre("milk", context.inner_density)),
     )
     # Paths that follow the light inside; the node's other method is tuned for skin.
     shader.subsurface_method = "RANDOM_WALK"
@@ -113,17 +98,21 @@ def _glass(builder: NodeBuilder, context: LookContext) -> None:
 @draws("stone")
 def _stone(builder: NodeBuilder, context: LookContext) -> None:
     """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
-    red, green, blue = or_default(context.color, (0.32, 0.30, 0.28))
+    stone = or_default(context.color, (0.32, 0.30, 0.28))
+    red, green, blue = context.own_shade(stone, brightness=0.35, warmth=0.1)
     coordinates = builder.node("ShaderNodeTexCoord").outputs
     # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box. Ground
     # that reaches to the horizon has as many in the domain's size.
     is_ground = context.surface == "ground"
     place = coordinates["Object" if is_ground else "Generated"]
     scale = 7.0 / context.domain_size if is_ground else 7.0
+    if not is_ground:
+        place = builder.vector_math("ADD", place, tuple(10.0 * each for each in context.own_numbers(3)))
     noise = builder.noise(place, Scale=scale, Detail=6.0, Roughness=0.62)
+    depth = 0.006 * context.domain_size if context.edges is None else 0.03 * math.hypot(*context.edges)
     dark = (0.55 * red, 0.55 * green, 0.55 * blue)
     light = (min(1.0, 1.35 * red), min(1.0, 1.35 * green), min(1.0, 1.35 * blue))
-    bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=0.006 * context.domain_size, Height=noise)
+    bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=depth, Height=noise)
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
         Base_Color=builder.ramp(noise, (0.3, dark), (0.72, light)),
@@ -173,6 +162,14 @@ def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(builder.mix_shaders(seen, through, reflection))
 
 
+@draws("metal")
+def _metal(builder: NodeBuilder, context: LookContext) -> None:
+    """Steel, of another melt and polish for each body."""
+    polish = 2.0 ** (0.35 * context.own_numbers(3)[2])
+    color = context.own_shade((0.62, 0.61, 0.60), brightness=0.1, warmth=0.05)
+    _even(builder, context, color=color, roughness=0.28 * polish, Metallic=1.0)
+
+
 def _even(builder: NodeBuilder, context: LookContext, *, color: Color, roughness: float, **inputs: float) -> None:
     """An opaque surface of one colour; other inputs of the shader by name."""
     builder.surface(
@@ -188,7 +185,6 @@ def _even(builder: NodeBuilder, context: LookContext, *, color: Color, roughness
 draws("rubber")(partial(_even, color=(0.95, 0.56, 0.02), roughness=0.42, Specular_IOR_Level=0.45))
 draws("ceramic")(partial(_even, color=(0.82, 0.79, 0.74), roughness=0.35, Coat_Weight=0.6, Coat_Roughness=0.06))
 draws("plastic")(partial(_even, color=(0.62, 0.06, 0.05), roughness=0.25, IOR=1.46))
-draws("metal")(partial(_even, color=(0.62, 0.61, 0.60), roughness=0.28, Metallic=1.0))
 # The cut edge of a pane, where glass shows its green.
 draws("tank_edge")(partial(_even, color=(0.50, 0.72, 0.66), roughness=0.15, Specular_IOR_Level=0.6))
 
@@ -236,8 +232,3 @@ def _homogeneous_absorption(builder: NodeBuilder, coefficients: tuple[float, ...
     density = max(coefficients)
     color = tuple(1.0 - value / density for value in coefficients)
     return builder.node("ShaderNodeVolumeAbsorption", Color=color, Density=density)
-
-
-def _absorption_of_tint(tint: Color) -> Color:
-    """Absorption that turns white into `tint` over one metre of water ten times exaggerated [1/m]."""
-    return tuple(-math.log(min(max(channel, 0.02), 0.999)) / 10.0 for channel in tint)

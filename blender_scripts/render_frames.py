@@ -286,7 +286,8 @@ class SceneRenderer:
             pixel_angle=camera.pixel_angle(spec),
             smoke_box=smoke_box,
             surface="sheet" if kind == "mesh_sequence" else "body",
-            edges=None if at_rest is None else geometry.edges_of(at_rest),
+            edges=description.get("edges") if at_rest is None else geometry.edges_of(at_rest),
+            name=name,
             wets=_wets(description),
         )
         if description["material"]["blend"] is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
@@ -44,6 +45,7 @@ class LookContext:
         smoke_box: of a volume.
         surface: what a texture hangs on.
         edges: of the box around a body at rest, in its own axes [m].
+        name: of the body, whose texture and shade are its own; empty for the ground.
         wets: whether the mesh tells where it touches solids, as a fluid's does (`wetting`).
 
     The others are as in `render.parameters.MaterialParameters`.
@@ -54,6 +56,7 @@ class LookContext:
     smoke_box: SmokeBox | None = None
     surface: SurfaceKind = "body"
     edges: tuple[float, float, float] | None = None
+    name: str = ""
     wets: bool = False
     color: Color | None = None
     roughness: float | None = None
@@ -64,6 +67,26 @@ class LookContext:
     edge_fade: float | None = None
     emission: float | None = None
     flame_temperature: float | None = None
+
+    @property
+    def inner_density(self) -> float:
+        """Density of a look that light goes into; a specification gives it to each object that has one."""
+        assert self.density is not None, "the specification gives a density to looks that have an inside"
+        return self.density
+
+    def own_numbers(self, count: int) -> list[float]:
+        """Numbers from -1 to 1 by the name of the body, its parts included: the same in every process and frame."""
+        if not self.name:
+            return [0.0] * count
+        digest = hashlib.blake2b(self.name.partition(".")[0].encode(), digest_size=2 * count).digest()
+        return [2.0 * int.from_bytes(digest[2 * place : 2 * place + 2], "big") / 65535.0 - 1.0 for place in range(count)]
+
+    def own_shade(self, color: Color, *, brightness: float, warmth: float) -> Color:
+        """The body's own shade of a colour: so many stops brighter or darker at most, and warmer or cooler."""
+        light, warm = self.own_numbers(2)
+        stops = brightness * light + warmth * warm, brightness * light, brightness * light - warmth * warm
+        red, green, blue = (min(1.0, channel * 2.0**each) for channel, each in zip(color, stops, strict=True))
+        return red, green, blue
 
     @classmethod
     def of(cls, material: dict[str, Any], **scene: Any) -> LookContext:

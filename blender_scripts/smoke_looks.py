@@ -8,7 +8,6 @@ from blender_scripts.black_body import LUMINANCE_EXPONENT_K
 from blender_scripts.flames import Glow
 from blender_scripts.shading import Color, LookContext, NodeBuilder, SmokeBox, draws, or_default
 
-_OPTICAL_SIZE = 22.0  # optical depth of smoke of density 1 across the whole domain
 _EDGE_FADE = 0.08  # width of the fade at open faces, in shortest edges of the box
 _FAR = 1.0e6  # distance of a face that does not fade [m]
 DEFAULT_FLAME_TEMPERATURE_K = 1500.0  # of wood fires: 1100 to 1600 K where they glow
@@ -50,7 +49,7 @@ def _fire(builder: NodeBuilder, context: LookContext) -> None:
 def glow_of(context: LookContext) -> Glow:
     """The light of a fire, as its look has it."""
     return Glow(
-        extinction=_extinction(context),
+        extinction=context.inner_density,
         emission=or_default(context.emission, DEFAULT_EMISSION),
         flame_temperature=or_default(context.flame_temperature, DEFAULT_FLAME_TEMPERATURE_K),
         box=_box(context),
@@ -60,7 +59,7 @@ def glow_of(context: LookContext) -> Glow:
 
 def _principled(builder: NodeBuilder, context: LookContext, *, color: Color) -> tuple[Any, Any]:
     """A volume that scatters and absorbs: its node, and its extinction at density 1 [1/m] as a number or socket."""
-    extinction: Any = _extinction(context)
+    extinction: Any = context.inner_density
     fade = _fade(builder, context)
     if fade is not None:
         extinction = builder.math("MULTIPLY", fade, extinction)
@@ -73,10 +72,6 @@ def _principled(builder: NodeBuilder, context: LookContext, *, color: Color) -> 
     )
     builder.volume(shader)
     return shader, extinction
-
-
-def _extinction(context: LookContext) -> float:
-    return or_default(context.density, _OPTICAL_SIZE / context.domain_size)
 
 
 def _fade(builder: NodeBuilder, context: LookContext) -> Any | None:

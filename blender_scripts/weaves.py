@@ -70,6 +70,8 @@ DENIM = Weave(4, 1, 1, 0.8e-3, (0.012, 0.030, 0.100), (0.15, 0.16, 0.18), 0.9, 0
 RESOLVED, UNRESOLVED = 0.5, 1.0
 """Threads per pixel: up to the first, Nyquist's, threads are drawn as they are; from the second on there are none."""
 
+_BOLT = 50.0  # how far apart the noises of two cloths may be [its features]
+
 HALF_UNDULATION = 0.5  # how far a thread goes up and down, in its radii
 
 
@@ -82,8 +84,12 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
     detail = _detail(builder, context.pixel_angle / spacing)
     weft_share, brightness = mean_appearance(weave)
     shown_weft = _faded(builder, shows_weft, weft_share, detail)
-    color = _colors(builder, weave, or_default(context.color, weave.warp), shown_weft)
-    light = _faded(builder, _brightness(builder, weave, height, u, v), brightness, detail)
+    dyed = partial(context.own_shade, brightness=0.12, warmth=0.04)
+    weft = None if weave.weft is None else dyed(weave.weft)
+    color = _colors(builder, or_default(context.color, dyed(weave.warp)), weft, shown_weft)
+    (place,) = context.own_numbers(1)
+    bolt = _BOLT * place
+    light = _faded(builder, _brightness(builder, weave, height, u, v, bolt), brightness, detail)
     color = builder.scaled(color, light)
     strength = builder.math("MULTIPLY", detail, 0.7)
     bump = builder.node("ShaderNodeBump", Distance=0.5 * spacing, Strength=strength, Height=height)
@@ -179,25 +185,25 @@ def _round(builder: NodeBuilder, across: Any, undulation: Any) -> Any:
     return builder.math("ADD", profile, builder.math("MULTIPLY", undulation, HALF_UNDULATION))
 
 
-def _colors(builder: NodeBuilder, weave: Weave, warp: Color, shows_weft: Any) -> Any:
+def _colors(builder: NodeBuilder, warp: Color, weft: Color | None, shows_weft: Any) -> Any:
     """Colour of the thread that is on top; seen from behind, that is the one that lies below here."""
     back = builder.node("ShaderNodeNewGeometry").outputs["Backfacing"]
     shown = builder.math("ABSOLUTE", builder.math("SUBTRACT", shows_weft, back))
-    return builder.mix_colors(shown, warp, weave.weft or warp)
+    return builder.mix_colors(shown, warp, weft or warp)
 
 
-def _brightness(builder: NodeBuilder, weave: Weave, height: Any, u: Any, v: Any) -> Any:
-    """A factor on colours, which are uneven along threads and darker between them."""
+def _brightness(builder: NodeBuilder, weave: Weave, height: Any, u: Any, v: Any, bolt: float) -> Any:
+    """A factor on colours, which are uneven along threads, differently in each bolt, and darker between them."""
     # Thick and thin places of a thread are some forty spacings long.
-    uneven = builder.math("ADD", _streaks(builder, u, 1.0, v, 0.025), _streaks(builder, u, 0.025, v, 1.0))
+    uneven = builder.math("ADD", _streaks(builder, u, 1.0, v, 0.025, bolt), _streaks(builder, u, 0.025, v, 1.0, bolt))
     uneven = builder.math("MULTIPLY_ADD", builder.math("SUBTRACT", uneven, 1.0), 2.0 * weave.unevenness, 1.0)
     light = builder.math("MINIMUM", builder.math("MULTIPLY_ADD", height, 1.0 - weave.gaps, weave.gaps), 1.0)
     return builder.math("MULTIPLY", uneven, builder.math("MAXIMUM", light, 0.0))
 
 
-def _streaks(builder: NodeBuilder, u: Any, u_scale: float, v: Any, v_scale: float) -> Any:
+def _streaks(builder: NodeBuilder, u: Any, u_scale: float, v: Any, v_scale: float, bolt: float) -> Any:
     """Noise [0, 1] about 0.5 that is drawn out along one direction of threads."""
-    place = builder.combined(builder.math("MULTIPLY", u, u_scale), builder.math("MULTIPLY", v, v_scale))
+    place = builder.combined(builder.math("MULTIPLY", u, u_scale), builder.math("MULTIPLY", v, v_scale), bolt)
     return builder.noise(place, Scale=0.7, Detail=2.0)
 
 

@@ -6,6 +6,7 @@ as many rings as a beam; those of the ground in boards.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from blender_scripts.geometry import REST_UV
@@ -14,21 +15,25 @@ from blender_scripts.shading import Color, LookContext, NodeBuilder, draws, or_d
 OILED_OAK: Color = (0.36, 0.19, 0.085)
 _RINGS = 9.0  # in a trunk's width
 _PITH = (0.42, 0.31)
-"""Where the rings have their middle, from the middle of the body [trunks]: rings are bows, not targets."""
+"""Where the rings have their middle, from the middle of the ground's boards [trunks]: rings are bows, not targets."""
+_PITH_DISTANCE = (0.52, 0.2)
+"""Of bodies, in any direction: in the mean, and how much more or less for one or the other [trunks]."""
+_TRUNK_LENGTH = 40.0  # that bodies are cut from, to both sides of its middle [trunks]
+_BRIGHTNESS, _WARMTH = 0.35, 0.1  # how much wood differs from body to body [stops]
 _BOARD_WIDTH, _BOARD_LENGTH = 0.15, 1.35  # of the ground, in diagonals of the domain
 _JOINT = 0.018  # half the width of the gap between boards [boards' widths]
-_SHEET_TRUNK = 0.25  # width of the trunk that a sheet is cut from, in diagonals of the domain
+_SHEET_TRUNK = 0.4  # width of the trunk that a sheet is cut from, in diagonals of the sheet
 
 
 @draws("wood")
 def _wood(builder: NodeBuilder, context: LookContext) -> None:
     """Oiled oak: late wood darker than early wood, fibres along the grain, a soft shine."""
-    base = or_default(context.color, OILED_OAK)
+    base = context.own_shade(or_default(context.color, OILED_OAK), brightness=_BRIGHTNESS, warmth=_WARMTH)
     position, tone, joint = _boards(builder, context) if context.surface == "ground" else _trunk(builder, context)
     # Trunks are not round: a slow noise, drawn out along the grain, bends the rings.
     bend = _noise(builder, position, (1.1, 1.1, 0.32), detail=2.0)
     across = builder.vector_math("MULTIPLY", position, (1.0, 1.0, 0.0))
-    distance = builder.vector_math("LENGTH", builder.vector_math("ADD", across, (*_PITH, 0.0)))
+    distance = builder.vector_math("LENGTH", builder.vector_math("ADD", across, (*_pith(context), 0.0)))
     radius = builder.math("ADD", distance, builder.math("MULTIPLY", bend, 0.45))
     phase = builder.math("FRACT", builder.math("MULTIPLY", radius, _RINGS))
     # Early wood darkens towards late wood slowly; the next year begins sharply.
@@ -48,19 +53,32 @@ def _wood(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(shader)
 
 
+def _pith(context: LookContext) -> tuple[float, float]:
+    """Where the rings have their middle [trunks]."""
+    if context.surface == "ground":
+        return _PITH
+    turn, farther = context.own_numbers(2)
+    mean, most = _PITH_DISTANCE
+    distance = mean + most * farther
+    return distance * math.cos(math.pi * turn), distance * math.sin(math.pi * turn)
+
+
 def _trunk(builder: NodeBuilder, context: LookContext) -> tuple[Any, Any, Any]:
-    """The place in a trunk, across twice and along it [trunks], and two factors that change nothing."""
+    """The place in the body's trunk, across twice and along it [trunks], and two factors that change nothing."""
+    edges = context.edges or (context.domain_size,) * 3
     if context.surface == "sheet":
         coordinates = builder.node("ShaderNodeUVMap")
         coordinates.uv_map = REST_UV
-        place, order, width = coordinates.outputs[0], [0, 2, 1], _SHEET_TRUNK * context.domain_size
+        place, order, width = coordinates.outputs[0], [0, 2, 1], _SHEET_TRUNK * math.hypot(*edges)
     else:
         place = builder.node("ShaderNodeTexCoord").outputs["Object"]
-        edges = context.edges or (context.domain_size,) * 3
         order = sorted(range(3), key=lambda axis: edges[axis])  # the trunk runs along the longest, as wide as the next
         width = edges[order[1]]
     parts = builder.split(builder.scaled(place, 1.0 / max(width, 1e-9)))
-    return builder.combined(*(parts[axis] for axis in order)), 1.0, 1.0
+    # No two bodies come from the same place of it.
+    (along,) = context.own_numbers(1)
+    place = builder.combined(*(parts[axis] for axis in order))
+    return builder.vector_math("ADD", place, (0.0, 0.0, _TRUNK_LENGTH * along)), 1.0, 1.0
 
 
 def _boards(builder: NodeBuilder, context: LookContext) -> tuple[Any, Any, Any]:

@@ -18,8 +18,6 @@ _ALPHA_OF_CLEAR_BODIES = 0.45
 _WATER_COLOR = (0.10, 0.36, 0.62)  # of a body that lets light through and has no colour of its own
 _FIRE_COLOR = (0.95, 0.35, 0.05)
 
-_SMOKE_DENSITY = 12.0  # extinction [1/m], where the job leaves it to the look
-
 
 def apply_workbench_settings(bodies: Sequence[tuple[dict[str, Any], Any]], *, panes: Any | None) -> None:
     """Make the finished scene one that Workbench draws: flat colours like those of the looks, studio light, shadows.
@@ -48,7 +46,7 @@ def apply_workbench_settings(bodies: Sequence[tuple[dict[str, Any], Any]], *, pa
         material.diffuse_color = _viewport_color(material, looks.get(material.name, {}))
     for described, made in bodies:
         if made.type == "VOLUME":
-            made.data.display.density = described["material"].get("density") or _SMOKE_DENSITY
+            made.data.display.density = described["material"]["density"]
     # Workbench sorts no panes behind each other; the rims alone tell where the tank is.
     if panes is not None:
         panes.hide_render = True

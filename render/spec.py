@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, field_validator
 
+from blender_scripts.optics import INSIDES
 from render.camera_path import CameraPath
 from render.parameters import (
     LightParameters,
@@ -29,6 +30,8 @@ SPEC_VERSION: Literal[4] = 4
 def _whole(material: MaterialParameters) -> MaterialParameters:
     if not material.is_whole:
         raise ValueError("an object needs a look or a material of a .blend file")
+    if material.look in INSIDES and material.density is None:
+        raise ValueError(f'an object of the look "{material.look}" needs a density')
     return material
 
 
@@ -76,6 +79,7 @@ class MeshSequenceObject(Parameters):
         gt=0.0,
         description="A fluid: how near its surface comes to the floor, bodies and cloths where it touches them [m].",
     )
+    edges: Vector3 | None = Field(default=None, description="A cloth: of the box around it at rest [m].")
 
 
 class PointSequenceObject(Parameters):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import LiveParameters
+from pipeline.model.boxes import Box
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
@@ -124,6 +125,10 @@ class Kind:
     drawing: float = 0.0  # time that its bodies add to a picture, over that of a scene of one fluid [-]
     wears: str = "rigid"  # the kind whose looks its bodies can have (`blender_scripts.look_table`)
     material: Callable[[Any], Mapping[str, MaterialParameters]]  # usual materials of the parts of a body, itself first
+    # size of a body that its look is scaled by [m]: of a liquid its own, of smoke its source's
+    look_size: Callable[[Job, Any], float]
+    # boxes that a body is in by the job, beside the domain, for a camera that shows the whole scene
+    boxes: Callable[[Job, Any], Iterable[Box]] = lambda _job, _body: ()
     # the solids that its tables place, each with the path of its table below the body's
     placements: Callable[[Job, int], Iterator[tuple[KeyPath, Placement]]] = lambda _job, _index: iter(())
     # looks at all bodies of the kind; returns the number of their elements

@@ -10,8 +10,9 @@ from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
-from pipeline.kinds.elements import count_nodes
+from pipeline.kinds.elements import count_nodes, sheet_of
 from pipeline.kinds.live_parameters import CLOTH_LIVE
+from pipeline.kinds.sizes import boxes_of_sheet, size_of_sheet
 from pipeline.kinds.work import cloth_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
@@ -68,7 +69,9 @@ def _coarser_sheet(path: KeyPath, sheet: RectangleSheet, factor: float) -> Chang
 
 
 def _objects(_job: Job, _layout: JobLayout, cloth: ClothParameters, material_of: Materials) -> Iterator[SceneObject]:
-    yield MeshSequenceObject(name=cloth.name, file=MESH.file_of(cloth.name), material=material_of(BODY))
+    yield MeshSequenceObject(
+        name=cloth.name, file=MESH.file_of(cloth.name), material=material_of(BODY), edges=sheet_of(cloth).edges
+    )
 
 
 def _reach(_job: Job, _layout: JobLayout, _cloth: ClothParameters, group: h5py.Group) -> Reach | None:
@@ -115,6 +118,8 @@ CLOTH = Kind(
     drawing=0.4,
     wears="cloth",
     material=lambda cloth: {BODY: LOOKS[cloth.material]},
+    look_size=size_of_sheet,
+    boxes=boxes_of_sheet,
     check=_check,
     coarser=_coarser,
     lighter="fewer nodes of a cloth.shape",

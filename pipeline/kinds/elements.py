@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from functools import cache
 from math import inf, prod
+from typing import NamedTuple
 
 from pipeline.base.content import status_of
 from pipeline.base.errors import MissingInputError
 from sim.cloth.parameters import ClothParameters, RectangleSheet
+from sim.core.parameters import Vector3
 from sim.fluid.parameters import FluidParameters
 from sim.scene import SceneParameters
 from sim.shapes.parameters import BoxShape, MeshShape
+
+THINNEST = 1.0e-6
+"""Edge of the box around a flat sheet [m]."""
 
 MOST_IN_A_VOLUME = 1.5
 """Particles of a thin block or a narrow opening, over what its volume holds: the last ones reach beyond it."""
@@ -38,23 +43,37 @@ def count_cloth_nodes(scene: SceneParameters) -> int:
 
 
 def count_nodes(cloth: ClothParameters) -> int:
-    """Number of nodes; a mesh is read for it, once, as files of a size hold ten times as many or as few.
+    """Number of nodes; raises as `sheet_of`."""
+    return sheet_of(cloth).nodes
+
+
+class SheetMeasures(NamedTuple):
+    """Measures of a cloth at rest."""
+
+    nodes: int
+    edges: Vector3  # of the box around it [m]
+
+
+def sheet_of(cloth: ClothParameters) -> SheetMeasures:
+    """Measures of a cloth; a mesh is read for them, once, as files of a size hold ten times as many nodes or as few.
 
     Raises MissingInputError: a mesh file cannot be read, or holds no sheet.
     """
     shape = cloth.shape
     if isinstance(shape, RectangleSheet):
-        return prod(shape.node_counts)
+        return SheetMeasures(prod(shape.node_counts), (*shape.size, THINNEST))
     status = status_of(shape.file, "mesh")
-    return _nodes_of_mesh(shape, status.st_size, status.st_mtime_ns)
+    return _sheet_of_mesh(shape, status.st_size, status.st_mtime_ns)
 
 
 @cache
-def _nodes_of_mesh(shape: MeshShape, _size: int, _mtime_ns: int) -> int:
+def _sheet_of_mesh(shape: MeshShape, _size: int, _mtime_ns: int) -> SheetMeasures:
     from sim.cloth.sheet import build_sheet
     from sim.shapes.solid import ShapeError
 
     try:
-        return len(build_sheet(shape).vertices)
+        vertices = build_sheet(shape).vertices
     except ShapeError as error:
         raise MissingInputError(f"{error}; the job needs it") from error
+    x, y, z = (vertices.max(axis=0) - vertices.min(axis=0)).clip(min=THINNEST).tolist()
+    return SheetMeasures(len(vertices), (x, y, z))

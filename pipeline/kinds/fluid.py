@@ -14,6 +14,7 @@ from pipeline.kinds.base import Change, Display, Kind, Materials, Product, Solid
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.elements import most_particles_of
 from pipeline.kinds.live_parameters import FLUID_LIVE
+from pipeline.kinds.sizes import size_of_liquid
 from pipeline.kinds.work import fluid_work, mean_particles, surface_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, WHITEWATER
@@ -157,6 +158,7 @@ FLUID = Kind(
     drawing=1.0,
     wears="fluid",
     material=lambda _fluid: {BODY: MaterialParameters(look="water"), **WHITEWATER},
+    look_size=size_of_liquid,
     placements=_placements,
     check=_check,
     coarser=_coarser,

@@ -13,6 +13,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Display, Kind, Materials, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import RIGID_LIVE
+from pipeline.kinds.sizes import boxes_of_body, size_of_solid
 from pipeline.kinds.work import rigid_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
@@ -79,6 +80,8 @@ RIGID = Kind(
     about="Rigid bodies.",
     work=rigid_work,
     material=lambda body: NATURAL_MATERIALS.get(body.shape.type, {BODY: SOLID}),
+    look_size=size_of_solid,
+    boxes=boxes_of_body,
     placements=lambda job, index: iter([((), job.rigid[index])]),
     check=_check,
     shares_solver=lambda body: body.kind != "static",

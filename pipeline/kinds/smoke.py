@@ -12,7 +12,9 @@ from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Codec, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.sizes import size_of_smoke
 from pipeline.kinds.work import smoke_work
+from pipeline.model.boxes import smoke_box
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
@@ -143,6 +145,8 @@ SMOKE = Kind(
     drawing=1.4,
     wears="smoke",
     material=lambda _smoke: {BODY: MaterialParameters(look="smoke")},
+    look_size=size_of_smoke,
+    boxes=lambda job, smoke: [smoke_box(smoke, job.domain)],
     placements=_placements,
     check=_check,
     coarser=_coarser,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field, create_model
 
 from blender_scripts.look_table import LOOK_TABLE
+from blender_scripts.optics import INSIDES, usual_density
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
 from pipeline.kinds.base import Kind
@@ -111,7 +112,7 @@ _RANKS: dict[type, int] = {
 def drawn_bodies(job: Job, layout: JobLayout) -> Iterator[tuple[Kind, Any, SceneObject]]:
     """Every object that the renderer draws, with its body and that one's kind."""
     for _, kind, body in bodies(job):
-        for drawn in kind.objects(job, layout, body, partial(material_of, job, body.name)):
+        for drawn in kind.objects(job, layout, body, partial(_drawn_material, job, kind, body)):
             yield kind, body, drawn
 
 
@@ -121,6 +122,15 @@ def scene_objects(job: Job, layout: JobLayout) -> list[SceneObject]:
 
 
 # --- materials ---
+
+
+def _drawn_material(job: Job, kind: Kind, body: Any, part: str) -> MaterialParameters:
+    """Material of a part as it is drawn: as dense as it is said to be, or as suits the size of the body."""
+    material = material_of(job, body.name, part)
+    if material.look not in INSIDES or material.density is not None:
+        return material
+    density = usual_density(material.look, kind.look_size(job, body), material.color)
+    return material.model_copy(update={"density": density})
 
 
 def material_of(job: Job, body: str, part: str = BODY) -> MaterialParameters:

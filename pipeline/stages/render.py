@@ -243,6 +243,8 @@ def decisive(spec: RenderSpec) -> dict[str, Any]:
             drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
         elif material["look"] is not None:
             material["look_revision"] = LOOK_TABLE[material["look"]].revision
+        if material["look"] is None or not LOOK_TABLE[material["look"]].fits_sheets:
+            drawn.pop("edges", None)  # nothing of it is scaled by them
     return document
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from blender_scripts.look_table import LOOK_TABLE, MATERIAL_KEYS, looks_for
 from pipeline.job.checks.camera import check_camera
+from pipeline.job.checks.optical_depth import check_optical_depths
 from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_set
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.kinds.base import Kind
@@ -45,6 +46,8 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
         check_camera(job, solids, findings)
         for kind in KINDS.values():
             findings.elements[kind.name] = kind.check(job, solids, budget, findings) if kind.bodies(job) else 0
+        if not findings.errors:
+            check_optical_depths(job, findings)
     return findings
 
 

@@ -1,0 +1,60 @@
+"""How much of the light gets through liquids and smoke, by their looks and sizes: whether these will be seen."""
+
+from typing import Any
+
+from blender_scripts.optics import INSIDES, per_metre, usual_density
+from pipeline.kinds.base import Kind
+from pipeline.kinds.table import bodies, is_meant, material_of
+from pipeline.model.job import Job
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings, Problem
+from render.parameters import MaterialParameters
+
+LEAST_DEPTH = 0.1
+"""Optical depth below which a tint or a smoke is not seen: a tenth of the light is changed."""
+TAR_DEPTH, WALL_DEPTH = 8.0, 30.0
+"""From the first on no colour gets through what absorbs; from the second on smoke has an edge as a solid has."""
+
+
+def check_optical_depths(job: Job, findings: Findings) -> None:
+    """Note the optical depth of each body that light goes into, and warn where it will not be seen, or is black."""
+    for path, kind, body in bodies(job):
+        material = material_of(job, body.name)
+        if material.look in INSIDES:
+            _check(job, path, kind, body, material, findings=findings)
+
+
+def _check(
+    job: Job, path: KeyPath, kind: Kind, body: Any, material: MaterialParameters, *, findings: Findings
+) -> None:
+    assert material.look is not None
+    size, inside = kind.look_size(job, body), INSIDES[material.look]
+    usual = usual_density(material.look, size, material.color)
+    density = usual if material.density is None else material.density
+    depths = [size * each for each in per_metre(material.look, density, material.color)]
+    is_grey = max(depths) == min(depths)
+    written = f"{depths[0]:.2g}" if is_grey else " / ".join(f"{each:.2g}" for each in depths) + " (red / green / blue)"
+    across = "across its source" if kind.wears == "smoke" else f"across {size:.2g} m"
+    findings.facts.append(
+        Problem(path, f'"{body.name}" as {material.look}: optical depth {written} {across}, density {density:.3g}')
+    )
+    if material.density is None:
+        return  # the job's own colour may be meant to be clear
+    at: KeyPath = (*_table_of(job, body.name), "density")
+    remedy = f"omit it, which is {usual:.2g} here"
+    if max(depths) < LEAST_DEPTH:
+        what = "the smoke" if kind.wears == "smoke" else "the tint"
+        findings.warn(
+            at, f'{density:g} gives "{body.name}" an optical depth of {max(depths):.2g}: {what} is not seen; {remedy}'
+        )
+    elif min(depths) > (WALL_DEPTH if inside.scatters else TAR_DEPTH) and material.look != "milk":
+        what = "it looks solid" if inside.scatters else "it is as black as tar"
+        findings.warn(
+            at, f'{density:g} gives "{body.name}" an optical depth of {min(depths):.2g}: {what}; {remedy}'
+        )
+
+
+def _table_of(job: Job, name: str) -> KeyPath:
+    """The table of materials that gives a body its density."""
+    tables = [written for written, said in job.material.items() if said.density is not None and is_meant(written, name)]
+    return ("material", name if name in tables else tables[-1])
