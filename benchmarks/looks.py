@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from blender_scripts.look_table import CLOTHS, LOOK_TABLE, looks_for
+from blender_scripts.optics import usual_density
 from render.blender import open_renderer
 from render.camera_path import CameraPath
 from render.cloth import vertex_normals
@@ -30,6 +31,7 @@ from sim.shapes.parameters import BunnyShape, Placement, SphereShape
 from sim.shapes.placement import build_solid
 
 WIDTH, HEIGHT = 240, 180
+DROP_SIZE = 0.65  # of both drops as one liquid: the edge of the cube of their volume [m]
 BESIDE = (-1.1, 0.05, 1.2)
 """Where three things stand in a wide picture, along x [m]."""
 SHEETS_BESIDE = (-1.08, -0.04, 1.0)
@@ -100,8 +102,9 @@ def solids(first: MaterialParameters, second: MaterialParameters) -> tuple[MeshO
     )
 
 
-def liquid(material: MaterialParameters, x: float = 0.05) -> tuple[MeshObject, ...]:
+def liquid(look: str, x: float = 0.05) -> tuple[MeshObject, ...]:
     """A drop that lies there, and one that falls."""
+    material = MaterialParameters(look=look, density=usual_density(look, DROP_SIZE))
     return (
         MeshObject(name=f"lying {x}", file="lying.ply", position=(x, 0.0, 0.0), material=material),
         MeshObject(name=f"falling {x}", file="drop.ply", position=(x + 0.1, 0.0, 0.66), material=material),
@@ -148,8 +151,8 @@ def all_scenes() -> dict[str, Scene]:
         material = MaterialParameters(look=look)
         scenes[f"look-{look}"] = Scene(solids(material, material))
     for look in LIQUID_LOOKS:
-        scenes[f"look-{look}"] = Scene(liquid(MaterialParameters(look=look)))
-    beside = [liquid(MaterialParameters(look=look), x) for look, x in zip(LIQUID_LOOKS, BESIDE, strict=True)]
+        scenes[f"look-{look}"] = Scene(liquid(look))
+    beside = [liquid(look, x) for look, x in zip(LIQUID_LOOKS, BESIDE, strict=True)]
     scenes["look-liquids"] = Scene(sum(beside, ()), width=2 * WIDTH)
     for cloth in CLOTH_LOOKS:
         scenes[f"look-{cloth}"] = Scene(sheets(cloth), width=2 * WIDTH)

@@ -68,8 +68,8 @@ _SMOKE = Inside(lambda _color: (1.0, 1.0, 1.0), true_size=2.0, tinted_size=2.0, 
 INSIDES: dict[str, Inside] = {
     # Nobody sees the blue of a glass of water: what is two metres across looks as it is, all else as blue as that.
     "water": Inside(_water, true_size=2.2, tinted_size=10.0),
-    "honey": Inside(_honey, true_size=0.01, tinted_size=0.01),
-    "milk": Inside(_milk, true_size=0.06, tinted_size=0.06, scatters=True),
+    "honey": Inside(_honey, true_size=0.025, tinted_size=0.01),
+    "milk": Inside(_milk, true_size=0.15, tinted_size=0.15, scatters=True),
     "smoke": _SMOKE,
     "fire": _SMOKE,
 }

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from render.parameters import CameraParameters, Vector3
 
@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 SENSOR_WIDTH_MM = 36.0
 AZIMUTH = math.radians(-62.0)
 ELEVATION = math.radians(17.0)  # a three-quarter view from slightly above: both sides of a box and its top are seen
+HORIZON = 0.8  # how high above the middle of the picture the horizon is at most, in halves of its height
 MARGIN = 0.05  # share of the picture that stays free on each side
 
 TURNS_FROM_DEG = 45.0
@@ -57,12 +58,15 @@ class View:
 
 
 def frame_points(points: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
-    """The closest view from the direction (`AZIMUTH`, `ELEVATION`) that shows all points, centred.
+    """The closest view from the heading `AZIMUTH` that shows all points and the horizon.
 
     In camera axes (right x, up y, forward z) a point is inside the frustum of a camera at (a, b, -d) if
     |x - a| <= t_x (z + d) and |y - b| <= t_y (z + d), where t is the tangent of half the field of view. For one axis
     alone the smallest d is (max(x/t - z) + max(-x/t - z)) / 2, and a lies in the middle; the larger d of the two
     axes serves both.
+
+    The view is inclined by `ELEVATION`, or by less if the horizon is in the picture then. What room is left above and
+    below lets the camera rise, until it stands `ELEVATION` above the middle of the points or they lie at the margin.
 
     Args:
         points: that are shown [m], (n, 3).
@@ -73,25 +77,27 @@ def frame_points(points: Array, *, focal_length_mm: float, aspect: float) -> tup
         Where the camera stands and what it looks at [m].
     """
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    forward = -np.array(
-        [math.cos(ELEVATION) * math.cos(AZIMUTH), math.cos(ELEVATION) * math.sin(AZIMUTH), math.sin(ELEVATION)]
-    )
+    # Blender's sensor fits the longer side of the picture.
+    tangent_long = SENSOR_WIDTH_MM / 2 / focal_length_mm
+    half_width, half_height = tangent_long * min(1.0, aspect), tangent_long / max(1.0, aspect)
+    pitch = min(ELEVATION, math.atan(HORIZON * half_height))
+    forward = -np.array([math.cos(pitch) * math.cos(AZIMUTH), math.cos(pitch) * math.sin(AZIMUTH), math.sin(pitch)])
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
     x, y, z = ((points - centre) @ np.stack([right, up, forward], axis=1)).T
 
-    # Blender's sensor fits the longer side of the picture.
-    tangent_long = SENSOR_WIDTH_MM / 2 / focal_length_mm
-    tangent_x = tangent_long * min(1.0, aspect) * (1 - 2 * MARGIN)
-    tangent_y = tangent_long / max(1.0, aspect) * (1 - 2 * MARGIN)
+    tangent_x, tangent_y = (half * (1 - 2 * MARGIN) for half in (half_width, half_height))
     distances, shifts = [], []
     for offset, tangent in ((x, tangent_x), (y, tangent_y)):
         positive, negative = np.max(offset / tangent - z), np.max(-offset / tangent - z)
         distances.append((positive + negative) / 2)
         shifts.append(tangent * (positive - negative) / 2)
-    target = centre + shifts[0] * right + shifts[1] * up
-    return _vector(target - max(distances) * forward), _vector(target)
+    distance = max(distances)
+    highest = float(np.min(y + tangent_y * (z + distance)))
+    rise = max(shifts[1], min(highest, distance * math.tan(ELEVATION - pitch)))
+    target = centre + shifts[0] * right + rise * up
+    return _vector(target - distance * forward), _vector(target)
 
 
 def _frame_all_round(points: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
@@ -110,6 +116,12 @@ def _frame_all_round(points: Array, *, focal_length_mm: float, aspect: float) ->
     forward = target - position
     along = (centre[:2] - target[:2]) @ forward[:2] / (forward[:2] @ forward[:2])
     return _vector(position), _vector(target + along * forward)
+
+
+def corners_of_boxes(boxes: ArrayLike) -> Array:
+    """Corners of boxes, of lower and upper corners (n, 2, 3): (8 n, 3)."""
+    corners = [[*itertools.product(*zip(*box, strict=True))] for box in np.asarray(boxes, dtype=np.float64)]
+    return np.concatenate(corners)
 
 
 class CameraPath:
@@ -145,11 +157,10 @@ class CameraPath:
         self._times = [key.time_s for key in camera.keyframe]
         self._centre = (np.asarray(box_min, dtype=np.float64) + np.asarray(box_max, dtype=np.float64)) / 2
         look_at = None if isinstance(camera.look_at, str) else camera.look_at
-        if camera.position is None and not camera.keyframe:
-            frame = frame_points if framed is None or not camera.orbit_deg_per_s else _frame_all_round
-            if framed is None:
-                framed = np.array([*itertools.product(*zip(box_min, box_max, strict=True))], dtype=np.float64)
-            position, middle = frame(framed, focal_length_mm=camera.focal_length_mm, aspect=aspect)
+        if camera.frames:
+            frame = _frame_all_round if camera.orbit_deg_per_s else frame_points
+            points = corners_of_boxes([(box_min, box_max)]) if framed is None else framed
+            position, middle = frame(points, focal_length_mm=camera.focal_length_mm, aspect=aspect)
         else:
             position, middle = camera.position or camera.keyframe[0].position, _vector(self._centre)
         self._position, self._look_at = np.array(position), np.array(middle if look_at is None else look_at)

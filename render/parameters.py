@@ -75,8 +75,9 @@ class CameraParameters(Parameters):
     )
     framing: Literal["domain", "action"] = Field(
         default="domain",
-        description="What it frames without a position. domain: the whole domain; action: all that moves or stands in "
-        "it over the whole film, without a few outlying particles. Then pictures wait for the simulation's end.",
+        description="What it frames without a position. domain: the whole domain, and bodies and smoke beside it; "
+        "action: all that moves or stands there over the whole film, without a few outlying particles. Then pictures "
+        "wait for the simulation's end.",
     )
     look_at: Vector3 | str | None = Field(
         default=None,
@@ -107,6 +108,11 @@ class CameraParameters(Parameters):
         """Whether its view differs from frame to frame."""
         with_body = self.follow is not None or isinstance(self.focus, str) or isinstance(self.look_at, str)
         return bool(self.keyframe) or self.orbit_deg_per_s != 0.0 or with_body
+
+    @property
+    def frames(self) -> bool:
+        """Whether it stands where it sees all of something."""
+        return self.position is None and not self.keyframe
 
     @property
     def frames_action(self) -> bool:

@@ -10,6 +10,8 @@ from fnmatch import fnmatchcase
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, create_model
 
 from blender_scripts.look_table import LOOK_TABLE
@@ -21,9 +23,11 @@ from pipeline.kinds.cloth import CLOTH
 from pipeline.kinds.fluid import FLUID
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.smoke import SMOKE
+from pipeline.model.boxes import domain_box
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, SOLID, WHITEWATER
 from pipeline.model.positions import KeyPath
+from render.camera_path import corners_of_boxes
 from render.parameters import MaterialParameters
 from render.spec import (
     MeshObject,
@@ -89,6 +93,30 @@ def placements(job: Job) -> Iterator[tuple[KeyPath, Placement]]:
     for path, kind, _ in bodies(job):
         for below, placement in kind.placements(job, int(path[1])):
             yield (*path, *below), placement
+
+
+def scene_boxes(job: Job) -> NDArray[np.float64]:
+    """What a camera shows that shows the whole scene: the domain, and boxes of bodies beside it, (n, 2, 3) [m].
+
+    Bodies that reach farther from the domain than its diagonal are ground or backdrop, and no subject. Of what lies
+    below the ground nothing is seen. Raises MissingInputError: a mesh file cannot be read.
+    """
+    domain = domain_box(job.domain)
+    reach = float(np.linalg.norm(domain[1] - domain[0]))
+    beside = [box for _, kind, body in bodies(job) for box in kind.boxes(job, body)]
+    low, high = domain[0] - reach, domain[1] + reach
+    near = [box for box in beside if (box >= low).all() and (box <= high).all() and box[1, 2] > domain[0, 2]]
+    boxes = np.stack([domain, *near])
+    boxes[..., 2] = np.maximum(boxes[..., 2], domain[0, 2])
+    return boxes
+
+
+def scene_points(job: Job) -> NDArray[np.float64] | None:
+    """Corners of the boxes of `scene_boxes` [m], (n, 3), for a camera that frames them; None for one that has a place.
+
+    Raises as `scene_boxes`.
+    """
+    return corners_of_boxes(scene_boxes(job)) if job.camera.frames else None
 
 
 def products_of(job: Job, layout: JobLayout, frame: int) -> list[tuple[Kind, Any, ArtifactPath]]:

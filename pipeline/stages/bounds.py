@@ -12,7 +12,8 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Resources, Task, TaskId
 from pipeline.kinds.base import Work
 from pipeline.kinds.rigid import rest_vertices
-from pipeline.kinds.table import bodies
+from pipeline.kinds.table import bodies, scene_boxes
+from pipeline.model.boxes import ALL, overlap, simulated_regions
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
 from pipeline.stages.base import FILE_S, FileWork, Stage, TaskContext
@@ -91,6 +92,7 @@ class BoundsStage(Stage):
                 smoke={smoke.name: smoke.corners(job.domain) for smoke in job.smoke},
                 static={body.name: {"position": body.position, "rotation_deg": body.rotation_deg} for body in static},
                 tank=job.has_panes,
+                **({"beside": beside} if (beside := _beside(job)) else {}),
             ),
         )
         return [*frames, film]
@@ -113,6 +115,13 @@ def read_framed(path: Path) -> NDArray[np.float64]:
     return corners_of(read_bounds(path)[ACTION])
 
 
+def _beside(job: Job) -> list[list[list[float]]]:
+    """Boxes of bodies that reach out of the domain and the smokes, which are of the world, too."""
+    regions = simulated_regions(job)
+    boxes = [box for box in scene_boxes(job) if all(overlap(box, region) < ALL for region in regions)]
+    return [box.tolist() for box in boxes]
+
+
 def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Reach]:
     """How far what there is at a frame reaches, by body."""
     with open_bodies(layout.path(layout.frame_cache(frame))) as groups:
@@ -126,8 +135,8 @@ def _of_film(context: TaskContext) -> Reach:
     job, layout = context.job, context.layout
     domain = np.array([job.domain.min, job.domain.max])
     smokes = [smoke.corners(job.domain) for smoke in job.smoke]
-    lower, upper = zip((job.domain.min, job.domain.max), *smokes, strict=True)
-    world = np.stack([np.min(lower, axis=0), np.max(upper, axis=0)])
+    boxes = np.concatenate([[domain, *smokes], scene_boxes(job)])
+    world = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
     reaches = [
         reach
         for frame in range(job.frame_count)

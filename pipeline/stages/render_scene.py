@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
-from pipeline.kinds.table import scene_objects
+from pipeline.kinds.table import scene_objects, scene_points
 from pipeline.model.job import Job
 from pipeline.stages.bounds import read_framed
 from pipeline.store.cache import read_frame
@@ -39,10 +39,11 @@ def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None 
 def camera_path(job: Job, framed: NDArray[np.float64] | None = None) -> CameraPath:
     """The path of a job's camera.
 
-    `framed` are points that it frames if it frames the action [m], (n, 3); the domain while they are not known.
+    `framed` are points that it frames if it frames the action [m], (n, 3); the whole scene while they are not known.
     """
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
+    framed = scene_points(job) if framed is None else framed
     return CameraPath(
         job.placed_camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts, framed=framed
     )

@@ -187,7 +187,7 @@ def test_a_camera_around_what_is_narrow_above_comes_nearer_than_to_its_box():
     reach = reach_of_points(np.concatenate([foot, tip]))
     camera = CameraParameters(framing="action", orbit_deg_per_s=30.0)
     near, far = (
-        CameraPath(camera, *DOMAIN, aspect=16 / 9, starts={}, framed=points).first()
+        CameraPath(camera, *DOMAIN, aspect=9 / 16, starts={}, framed=points).first()
         for points in (corners_of(reach), corners(box_of(reach)))
     )
     distance = [float(np.linalg.norm(np.subtract(view.position, view.look_at))) for view in (near, far)]

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.kinds.table import bodies
+from pipeline.base.errors import MissingInputError
+from pipeline.kinds.table import bodies, scene_points
 from pipeline.model.boxes import Box, domain_box, smoke_box, touch
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
@@ -33,7 +34,13 @@ def check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) 
         return  # its place follows from the film, which it then shows
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
-    path = CameraPath(job.placed_camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts)
+    try:
+        framed = scene_points(job)
+    except MissingInputError:
+        return  # the file is refused where the body is looked at
+    path = CameraPath(
+        job.placed_camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts, framed=framed
+    )
     last_s = (job.frame_count - 1) / job.fps
     views = {0.0: path.first()}
     if path.moves and not path.bodies:
