@@ -80,7 +80,7 @@ def write_scene(folder: Path, frames: list[int], options: argparse.Namespace) ->
         camera=Camera.on(path, f_stop=None, views=""),
         set=SetParameters(),
         objects=(
-            MeshSequenceObject(name="water", file="water{frame}.ply", material=MaterialParameters(look="water")),
+            MeshSequenceObject(name="water", file="water{frame}.ply", material=MaterialParameters(look="water", density=4.0)),
             VolumeSequenceObject(
                 name="smoke",
                 file="smoke{frame}.vdb",
@@ -88,7 +88,7 @@ def write_scene(folder: Path, frames: list[int], options: argparse.Namespace) ->
                 box_max=(0.5, 0.5, 1.0),
                 open_faces=(),
                 ambient_temperature=293.0,
-                material=MaterialParameters(look="smoke"),
+                material=MaterialParameters(look="smoke", density=12.7),
             ),
         ),
         render=RenderParameters(resolution=tuple(options.resolution), quality=options.quality, device="cpu"),

@@ -14,6 +14,7 @@ from mathutils import Vector
 from blender_scripts.camera import aim, pixel_angle
 from blender_scripts.compatibility import set_physical_sky
 from blender_scripts.errors import RenderInputError
+from blender_scripts.flattening import Backplate, EvenColor
 from blender_scripts.geometry import new_mesh_object, new_object
 from blender_scripts.looks import new_material
 from blender_scripts.ply import SurfaceMesh
@@ -86,14 +87,14 @@ class SetBuilder:
             context = LookContext.of({"color": self.parameters["color"]}, **scene)
             material = new_material(name, self.parameters["ground"], context)
         self.add_surface(mesh, name, material).location.z = -drop
-        if self.parameters["background"] != "set":
+        if not shows_set(self.parameters):
             self._add_shadow_catcher(self.color(own)).location.z = -0.5 * drop
 
     def add_surface(self, mesh: SurfaceMesh, name: str, material: Any) -> Any:
         """A surface of the set, which light and reflections meet whatever stands behind the picture."""
         surface = new_mesh_object(name, mesh)
         surface.data.materials.append(material)
-        surface.visible_camera = self.parameters["background"] == "set"
+        surface.visible_camera = shows_set(self.parameters)
         # What a wall keeps from the ground is none of the scene's shadows.
         surface.is_shadow_catcher = not surface.visible_camera
         return surface
@@ -136,10 +137,25 @@ def build_set(spec: dict[str, Any], folder: Path) -> None:
         _add_light(f"light {index}", kind, light["power"], tuple(light["color"]), size, place=place, target=target)
 
 
-def plain_background(parameters: dict[str, Any]) -> Color | None:
-    """The colour to lay pictures over once they are drawn, linear RGB; None for those that stay as they are."""
+def shows_set(parameters: dict[str, Any]) -> bool:
+    """Whether the camera sees ground and sky themselves, and not only the shadows on the ground."""
+    return parameters["background"] == "set" and parameters["backplate"] is None
+
+
+def what_is_behind(parameters: dict[str, Any], folder: Path) -> EvenColor | Backplate | None:
+    """What to lay pictures over once they are drawn; None for those that stay as they are.
+
+    Raises:
+        RenderInputError: the backplate cannot be read.
+    """
+    if parameters["backplate"] is not None:
+        return Backplate(folder / parameters["backplate"])
     if parameters["background"] != "plain":
         return None
+    return EvenColor(_plain_color(parameters))
+
+
+def _plain_color(parameters: dict[str, Any]) -> Color:
     return _color_of(parameters, PLASTER if parameters["name"] == "window" and parameters["hdri"] is None else GREY)
 
 
@@ -240,7 +256,7 @@ def _build_window(stage: SetBuilder) -> None:
         size = 0.95 * scale * stage.size
         pane = _add_light(f"pane {number}", "AREA", power, (0.86, 0.93, 1.0), size, place=place, target=inwards)
         # A window in the picture is what one expects.
-        pane.visible_camera = stage.parameters["background"] == "set"
+        pane.visible_camera = shows_set(stage.parameters)
     place, target = stage.place(2.2, 0.6, 1.2), stage.place(0.0, 0.0, 0.35)
     power, size = 14.0 * stage.power, 2.2 * stage.size
     _add_light("bounce", "AREA", power, (1.0, 0.86, 0.70), size, place=place, target=target)

@@ -90,9 +90,9 @@ class SceneRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
-        self._has_alpha = spec["set"]["background"] != "set"
+        self._has_alpha = not lights.shows_set(spec["set"])
         bpy.context.scene.render.film_transparent = self._has_alpha
-        self._behind = lights.plain_background(spec["set"])
+        self._behind = lights.what_is_behind(spec["set"], self._folder)
         self.device: str = gpus.choose_device(spec["render"]["device"], gpu)
         self._camera = camera.add_camera(spec["camera"])
         self._format, self._passes = spec["render"]["format"], spec["render"]["passes"]

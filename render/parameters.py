@@ -230,9 +230,27 @@ class SetParameters(Parameters):
     rotation_deg: float = Field(
         default=0.0, description="How far the hdri is turned, counter-clockwise from above [degrees]."
     )
+    backplate: str | None = Field(
+        default=None,
+        description="Picture behind everything, .jpg or .png, relative to the job file: the camera alone sees it, as "
+        "it is, as large as fills the frame. Of the ground only the shadows are seen; light and reflections are the "
+        "set's.",
+    )
     tank: bool = Field(
         default=False, description="Show the domain's walls as a glass tank; its open_faces have no pane."
     )
+
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether ground and sky themselves are in the picture."""
+        return self.background == "set" and self.backplate is None
+
+    @model_validator(mode="after")
+    def _has_one_background(self) -> Self:
+        if self.backplate is not None and self.background != "set":
+            raise ValueError(f'background = "{self.background}" leaves no place for backplate; remove one of them')
+        return self
 
 
 class MaterialParameters(Parameters):

@@ -28,6 +28,8 @@ def input_files(job: Job) -> Iterator[InputFile]:
         yield InputFile((*place, "file"), shape.file, "mesh")
     if job.set.hdri is not None:
         yield InputFile(("set", "hdri"), job.set.hdri, "picture")
+    if job.set.backplate is not None:
+        yield InputFile(("set", "backplate"), job.set.backplate, "picture")
     for name, material in job.material.items():
         if material.blend is not None:
             file, inside = split_blend(material.blend)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import dist
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
@@ -125,8 +126,8 @@ class Kind:
     drawing: float = 0.0  # time that its bodies add to a picture, over that of a scene of one fluid [-]
     wears: str = "rigid"  # the kind whose looks its bodies can have (`blender_scripts.look_table`)
     material: Callable[[Any], Mapping[str, MaterialParameters]]  # usual materials of the parts of a body, itself first
-    # size of a body that its look is scaled by [m]: of a liquid its own, of smoke its source's
-    look_size: Callable[[Job, Any], float]
+    # size of a body that its look is scaled by [m]: of a liquid its own, of smoke its source's; the domain's if omitted
+    look_size: Callable[[Job, Any], float] = lambda job, _body: dist(job.domain.min, job.domain.max)
     # boxes that a body is in by the job, beside the domain, for a camera that shows the whole scene
     boxes: Callable[[Job, Any], Iterable[Box]] = lambda _job, _body: ()
     # the solids that its tables place, each with the path of its table below the body's

@@ -121,6 +121,10 @@ class BlendExport(_SceneExport):
             self._scene_task(job, layout, [*wet, *(each for each in played if each not in drawn_otherwise)]),
         ]
 
+    def left_out(self, job: Job) -> list[str]:
+        """What frames are laid over once they are drawn."""
+        return [] if job.set.backplate is None else [f"the backplate ({Path(job.set.backplate).name})"]
+
     def run(self, context: TaskContext) -> None:
         """Write the fluids of a frame, or the scene."""
         task = context.task

@@ -234,6 +234,10 @@ def decisive(spec: RenderSpec) -> dict[str, Any]:
         backdrop["name"] = None  # its light and sky are not there
     else:
         del backdrop["rotation_deg"]  # there is nothing to turn
+    if spec.set.backplate is not None:
+        backdrop["backplate"] = content_name(spec.set.backplate, "picture")
+    else:
+        del backdrop["backplate"]
     # Where a pane is left out; the tank has none above or below.
     document["open_faces"] = sorted({face for face in spec.open_faces if face[0] in "xy"}) if backdrop["tank"] else []
     for drawn in document["objects"]:

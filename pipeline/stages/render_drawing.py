@@ -145,7 +145,7 @@ class FrameDrawing:
 
 def may_be_empty(job: Job) -> bool:
     """Whether nothing is left of a picture where no body is."""
-    return job.set.background != "set"
+    return not job.set.is_seen
 
 
 _WARM: dict[str, Renderer] = {}

@@ -1,19 +1,22 @@
-"""Memory that a job's own pictures, an HDRI and those packed into .blend files, take in each renderer.
+"""Memory that a job's own pictures, an HDRI, a backplate and those packed into .blend files, take in each renderer.
 
-Measured with bpy 5.0.1 as the growth of the largest resident memory: 16 to 25
-bytes a pixel of an HDRI, with the map of where light comes from; of textures in a .blend file, 9.7 bytes a pixel of
-bytes and 42 of floats. Blender and Cycles hold a picture each, and for a while the file as it was read.
+Measured with bpy 5.0.1 as the growth of the largest resident memory: 16 to 25 bytes a pixel of an HDRI, with the map
+of where light comes from; of textures in a .blend file, 9.7 bytes a pixel of bytes and 42 of floats. Blender and Cycles
+hold a picture each, and for a while the file as it was read. A backplate is let go once it has the size of the frames:
+16 bytes a pixel if it has 16 bits, and its file.
 """
 
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
+from math import prod
 from pathlib import Path
 
 from pipeline.base.files import replacing
 from pipeline.base.parameter_set import digest_of
 from pipeline.job.input_files import split_blend
 from pipeline.store.receipts import hash_file
+from render.backplate import backplate_size
 from render.blend_file import Texture, read_textures
 from render.blender import BlenderUnavailableError
 from render.environment import environment_pixels
@@ -22,6 +25,7 @@ from render.spec import RenderSpec
 from sim.core.runtime import cache_folder
 
 BYTES_PER_HDRI_PIXEL = 25
+BYTES_PER_BACKPLATE_PIXEL = 20
 LIGHT_MAP_BYTES = 8 * 1024 * 512
 BYTES_PER_TEXTURE_PIXEL, BYTES_PER_FLOAT_TEXTURE_PIXEL = 11, 42
 
@@ -35,6 +39,9 @@ def own_picture_bytes(spec: RenderSpec) -> int:
     if spec.set.hdri is not None:
         with suppress(OSError):
             total += BYTES_PER_HDRI_PIXEL * (environment_pixels(Path(spec.set.hdri)) or 0) + LIGHT_MAP_BYTES
+    if spec.set.backplate is not None:
+        with suppress(OSError, InvalidFileError):
+            total += BYTES_PER_BACKPLATE_PIXEL * prod(backplate_size(Path(spec.set.backplate)))
     for drawn in spec.objects:
         if drawn.material.blend is not None:
             file, name = split_blend(drawn.material.blend)

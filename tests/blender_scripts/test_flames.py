@@ -104,6 +104,7 @@ def test_the_look_tells_lamps_of_its_fade():
     from blender_scripts.smoke_looks import glow_of
     box = SmokeBox((0.0, 0.0, 0.0), (1.0, 0.5, 2.0), ("z+",), 300.0)
     for own, width in (({}, 0.04), ({"edge_fade": 0.3}, 0.3), ({"edge_fade": 0.0}, 0.0)):
+        own["density"] = 5.0
         told = glow_of(LookContext.of(own, domain_size=2.0, pixel_angle=1e-3, smoke_box=box))
         assert told.box.open_faces == ("z+",) and abs(told.fade_width - width) < 1e-12, told
     """

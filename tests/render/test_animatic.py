@@ -153,7 +153,7 @@ def test_smoke_and_fire_are_seen_where_they_are(tmp_path, warm, look):
         density = np.zeros((cells,) * 3, np.float32)
         density[:filled] = 1.0
         write_frame(tmp_path, frame, density, kelvin=1200.0)
-    before, after = workbench_pictures(tmp_path, smoke_object(MaterialParameters(look=look)), frames=2)
+    before, after = workbench_pictures(tmp_path, smoke_object(MaterialParameters(look=look, density=12.0)), frames=2)
     # The left half of a cube of 0.6 m is full: 16 pixels of its 32 change, the right half does not.
     change = abs(after - before).mean(axis=2)[18:36]
     assert change[:, 36:46].mean() > 8.0

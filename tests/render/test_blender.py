@@ -309,7 +309,7 @@ def test_every_look_and_set_builds_and_draws(tmp_path):
             name=look,
             file="ball.ply",
             position=(-0.45 + 0.3 * (index % 4), 0.0, 0.15 + 0.3 * (index // 4)),
-            material=MaterialParameters(look=look),
+            material=MaterialParameters(look=look, density=5.0),
         )
         for index, look in enumerate(looks_for("rigid"))
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from render.camera_path import MARGIN, CameraPath, write_views
+from render.camera_path import HORIZON, MARGIN, CameraPath, View, write_views
 from render.parameters import CameraParameters
 from render.spec import Camera
 from render.visibility import screen_positions
@@ -40,6 +40,37 @@ def test_automatic_camera_shows_the_whole_domain_and_no_more_than_needed(low, hi
     filled = np.minimum(screen.max(axis=0), -screen.min(axis=0)).max()
     assert filled == pytest.approx(1 - 2 * MARGIN, abs=1e-9)
     assert view.look_at[2] < view.position[2]
+
+
+@pytest.mark.parametrize("focal_length_mm", [24.0, 50.0, 135.0])
+@pytest.mark.parametrize("aspect", [16 / 9, 1.0, 9 / 16])
+@pytest.mark.parametrize("size", [(1.0, 1.0, 6.0), (6.0, 6.0, 0.3), (4.0, 0.3, 0.2), (0.8, 0.8, 1.2)])
+def test_automatic_camera_shows_a_horizon_from_above_the_ground(size, aspect, focal_length_mm):
+    high = (*size[:2], size[2] - 3.0)
+    camera = CameraParameters(focal_length_mm=focal_length_mm)
+    view = CameraPath(camera, (0.0, 0.0, -3.0), high, aspect=aspect, starts={}).first()
+    assert view.position[2] > -3.0
+    # A point of the view's heading, so far away that it lies at the horizon.
+    heading = np.subtract(view.look_at, view.position) * (1.0, 1.0, 0.0)
+    far = np.array(view.position) + 1e6 * heading / np.linalg.norm(heading)
+    (across, up), *_ = screen_positions(view, far[None], aspect=aspect)
+    assert abs(across) < 1e-6
+    assert 0.0 < up <= HORIZON + 1e-6
+
+
+def test_automatic_camera_rises_where_the_picture_has_room():
+    """A pool is seen from above its rim, a tower from as low as the horizon asks for."""
+    pool, tower = (
+        CameraPath(CameraParameters(), low, high, aspect=16 / 9, starts={}).first()
+        for low, high in (((-2, -2, 0), (2, 2, 0.4)), ((-0.2, -0.2, 0), (0.2, 0.2, 4)))
+    )
+
+    def elevation(view: View, middle: tuple[float, float, float]) -> float:
+        across, up = np.linalg.norm(np.subtract(view.position, middle)[:2]), view.position[2] - middle[2]
+        return math.degrees(math.atan2(up, across))
+
+    assert 11.0 < elevation(pool, (0.0, 0.0, 0.2)) <= 17.0
+    assert 8.0 < elevation(tower, (0.0, 0.0, 2.0)) < 10.0
 
 
 def test_a_still_camera_does_not_move_and_looks_at_the_middle():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from blender_scenes import LUMINANCE, draw_all, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
+from PIL import Image
 from radiance_pictures import write_hdr
 
 from render.parameters import CameraParameters, LightParameters, MaterialParameters, SetParameters
@@ -126,6 +127,30 @@ def test_a_plain_background_has_exactly_the_colour_of_the_set_and_shadows_on_it(
     assert np.ptp(ball.mean(axis=(0, 1))) < 60  # white, and not the background's 122
     below = picture[-4:, MIDDLE_COLUMN - 4 : MIDDLE_COLUMN + 4]
     assert (below.mean(axis=(0, 1)) < 0.9 * color).all()
+
+
+@pytest.mark.parametrize(("name", "size"), [("plate.png", (128, 128)), ("plate.jpg", (64, 128)), ("small.png", (16, 9))])
+def test_a_backplate_is_seen_as_it_is_behind_the_ball_and_its_shadow(tmp_path, name, size):
+    """Its upper half is blue, its lower half orange; what does not fit is cut off above and below alike."""
+    width, height = size
+    halves = np.zeros((height, width, 3), np.uint8)
+    halves[: height // 2], halves[height // 2 :] = (40, 90, 200), (220, 150, 60)
+    Image.fromarray(halves).save(tmp_path / name, quality=95)
+    picture = draw(tmp_path, backplate=str(tmp_path / name))
+    assert picture.shape[2] == 3
+    # A JPEG's colours are good to some levels. In a picture of 36 rows the halves meet in the middle.
+    np.testing.assert_allclose(picture[:16, :16], np.broadcast_to((40, 90, 200), (16, 16, 3)), atol=6)
+    np.testing.assert_allclose(picture[20:24, :4], np.broadcast_to((220, 150, 60), (4, 4, 3)), atol=6)
+    assert np.ptp(picture[BALL].mean(axis=(0, 1))) < 60  # white
+    below = picture[-4:, MIDDLE_COLUMN - 4 : MIDDLE_COLUMN + 4].mean(axis=(0, 1))
+    assert (below < 0.95 * np.array((220, 150, 60))).all()
+
+
+def test_a_backplate_that_is_gone_or_damaged_draws_nothing(tmp_path):
+    (tmp_path / "text.jpg").write_text("this is no picture")
+    for name in ("gone.jpg", "text.jpg"):
+        with pytest.raises(AssertionError, match=rf"cannot read the picture .*{name}"):
+            draw(tmp_path, backplate=str(tmp_path / name))
 
 
 def test_a_transparent_background_leaves_the_ball_and_its_shadow(tmp_path):

@@ -27,7 +27,7 @@ def surface(triangles: int) -> SurfaceMesh:
 
 def written(folder: Path, surfaces: list[SurfaceMesh], *, limit_bytes: int = 1_000_000) -> Path:
     """A file of a cube that turns and of a surface."""
-    material = MaterialParameters(look="water")
+    material = MaterialParameters(look="water", density=1.0)
     spec = RenderSpec(
         fps=10.0,
         domain_min=(0.0, 0.0, 0.0),

@@ -10,6 +10,7 @@ import pytest
 from blender_scenes import LUMINANCE, RESOLUTION, draw_all, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
 
+from blender_scripts.optics import usual_density
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters, SetParameters
 from render.spec import MeshObject, MeshSequenceObject, SceneObject
@@ -33,6 +34,12 @@ def patch(picture: np.ndarray, x: float, z: float, half: float) -> np.ndarray:
     return picture[round(row - reach) : round(row + reach), round(column - reach) : round(column + reach)]
 
 
+def liquid(look: str, size: float = 0.32, **keys: object) -> MaterialParameters:
+    """A look as it is by itself on a body of a size [m]."""
+    material = MaterialParameters.model_validate({"look": look, **keys})
+    return material.model_copy(update={"density": usual_density(look, size, material.color)})
+
+
 @pytest.fixture(scope="module")
 def liquids(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
     """Mean colour of the middle of a ball of each."""
@@ -42,7 +49,7 @@ def liquids(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
     picture = draw(
         folder,
         *(
-            MeshObject(name=look, file="ball.ply", position=(x, 0.0, 0.5), material=MaterialParameters(look=look))
+            MeshObject(name=look, file="ball.ply", position=(x, 0.0, 0.5), material=liquid(look))
             for look, x in places.items()
         ),
         resolution=(128, 72),
@@ -186,3 +193,37 @@ def test_caustics_bend_the_sun_s_light_and_leave_the_rest_of_the_ground_as_it_is
     behind = np.s_[8:28, 38:60]  # the ground beside the ball, away from the sun
     assert bent[behind].min() < 0.75 * straight[behind].min()
     assert bent[behind].max() > 1.1 * ground
+
+
+@pytest.mark.parametrize("look", ["wood", "stone", "metal"])
+def test_bodies_of_one_look_differ_by_their_names_and_by_nothing_else(look, tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.3))
+
+    def ball(name: str, **keys: object) -> np.ndarray:
+        material = MaterialParameters.model_validate({"look": look, **keys})
+        return draw(tmp_path, MeshObject(name=name, file="ball.ply", position=(0.0, 0.0, 0.5), material=material))
+
+    first, again, other = ball("oak"), ball("oak"), ball("ash")
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(patch(first, 0.0, 0.5, 0.2) - patch(other, 0.0, 0.5, 0.2)).mean() > 2.0
+
+
+def test_the_ground_and_what_the_job_says_of_metal_are_the_same_for_all_names(tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.3))
+    brass = MaterialParameters(look="metal", color=(0.8, 0.6, 0.3), roughness=0.2)
+    one, two = (
+        draw(tmp_path, MeshObject(name=name, file="ball.ply", position=(0.0, 0.0, 0.5), material=brass), samples=4)
+        for name in ("oak", "ash")
+    )
+    np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0])
+def test_red_wine_is_red_in_a_domain_of_any_size(factor, tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.2))
+    wine = liquid("water", color=(0.45, 0.02, 0.03))
+    ball = MeshObject(name="wine", file="ball.ply", position=(0.0, 0.0, 0.5), material=wine)
+    domain = {"domain_min": (-0.5 * factor, -0.5 * factor, 0.0), "domain_max": (0.5 * factor, 0.5 * factor, factor)}
+    (picture,) = draw_all(tmp_path, spec_of(ball, samples=24, motion_blur=False).model_copy(update=domain))
+    red, green, blue = patch(picture, 0.0, 0.5, 0.1).mean(axis=(0, 1))
+    assert red > 2.5 * max(green, blue)

@@ -9,12 +9,16 @@ from pipeline.kinds.checks.shapes import file_exists
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, quoted_list
+from render.backplate import read_backplate_size
 from render.environment import read_environment_size
 from render.errors import InvalidFileError
 from render.parameters import MaterialParameters
 
 # A picture of the whole sphere is 360 degrees wide and 180 high.
 _SPHERE_ASPECT = 2.0
+
+LEAST_SHOWN = 0.9
+"""Share of a backplate that is shown without a word."""
 
 
 def check_set(job: Job, findings: Findings) -> None:
@@ -35,14 +39,15 @@ def check_set(job: Job, findings: Findings) -> None:
             )
     if parameters.tank and not job.has_panes:
         findings.warn(("set", "tank"), "has no effect, as all sides of the domain are open: there is no pane")
-    if parameters.background != "set" and parameters.ground is not None:
-        findings.warn(
-            ("set", "ground"), f'is seen in reflections only, as background = "{parameters.background}" leaves it out'
-        )
-    if parameters.background == "plain" and job.render.format == "png16":
+    if parameters.backplate is not None:
+        _check_backplate(job, Path(parameters.backplate), findings)
+    if not parameters.is_seen and parameters.ground is not None:
+        other = "backplate" if parameters.backplate is not None else f'background = "{parameters.background}"'
+        findings.warn(("set", "ground"), f"is seen in reflections only, as {other} leaves it out")
+    if job.render.format == "png16" and (parameters.background == "plain" or parameters.backplate is not None):
+        key, what = ("backplate", "is what") if parameters.backplate is not None else ("background", 'is "plain", which')
         findings.error(
-            ("set", "background"),
-            'is "plain", which pictures are laid over in 8 bits, but render.format is "png16"; take "png"',
+            ("set", key), f'{what} pictures are laid over in 8 bits, but render.format is "png16"; take "png"'
         )
 
 
@@ -75,3 +80,27 @@ def _check_hdri(name: str, findings: Findings) -> None:
     else:
         if width != _SPHERE_ASPECT * height:
             findings.warn(key, f"is {width} x {height} pixels; a picture of the whole sphere is twice as wide as high")
+
+
+def _check_backplate(job: Job, path: Path, findings: Findings) -> None:
+    key = ("set", "backplate")
+    if not file_exists(str(path), "picture", key, findings):
+        return
+    try:
+        width, height = read_backplate_size(path)
+    except InvalidFileError as error:
+        findings.error(key, str(error))
+        return
+    except OSError as error:
+        findings.error(key, f"cannot read {path}: {error.strerror}")
+        return
+    columns, rows = job.render.resolution
+    shown = min(width / columns, height / rows) ** 2 * columns * rows / (width * height)
+    if shown < LEAST_SHOWN:
+        findings.warn(
+            key,
+            f"is {width} x {height} pixels; {100.0 * (1.0 - shown):.0f} % of it is cut off to fill "
+            f"{columns} x {rows}",
+        )
+    if job.camera.moves:
+        findings.warn(key, "stands still behind a camera that moves")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fresh_python import run_python
 from needed_blender import needs_bpy
+from PIL import Image
 from radiance_pictures import write_hdr
 
 from pipeline.base.layout import JobLayout
@@ -19,6 +20,7 @@ from pipeline.stages.render_scene import render_spec
 from pipeline.stages.texture_memory import LIGHT_MAP_BYTES, bytes_of_textures, own_picture_bytes
 from render.blend_file import Texture, read_textures
 from render.environment import environment_pixels, read_environment_size
+from render.parameters import SetParameters
 
 BALL = {"name": "ball", "shape": {"type": "sphere", "radius": 0.1}}
 
@@ -101,6 +103,13 @@ def test_an_hdri_is_counted_in_the_memory_of_each_renderer(tmp_path):
     assert need(job()) == WORKER_BYTES + BYTES_PER_PIXEL * 1280 * 720
     # A picture in Blender and one in Cycles, of four floats or halves a pixel.
     assert need(job(tmp_path / "noon.hdr")) - need(job()) - LIGHT_MAP_BYTES >= (16 + 8) * 32 * 64
+
+
+def test_a_backplate_is_counted_in_the_memory_of_each_renderer(tmp_path):
+    Image.new("RGB", (64, 32)).save(tmp_path / "photo.png")
+    backplate = {"set": SetParameters(backplate=str(tmp_path / "photo.png"))}
+    spec = render_spec(job().model_copy(update=backplate), JobLayout(Path("film")))
+    assert own_picture_bytes(spec) >= 16 * 32 * 64  # floats, as Blender holds a picture of 16 bits
 
 
 def test_a_texture_counts_by_what_its_pixels_are():

@@ -80,6 +80,15 @@ def test_a_picture_around_the_scene_counts_by_what_is_in_it(tmp_path: Path) -> N
     assert len({noon, *others}) == 5
 
 
+def test_a_backplate_counts_by_what_is_in_it_and_a_set_without_one_as_before(tmp_path: Path) -> None:
+    here, there, other = (tmp_path / name for name in ("here.jpg", "there.JPG", "other.jpg"))
+    for path, content in ((here, b"street"), (there, b"street"), (other, b"beach")):
+        path.write_bytes(content)
+    street = frame_digest(set={"backplate": str(here)})
+    assert street == frame_digest(set={"backplate": str(there)})
+    assert len({street, frame_digest(), frame_digest(set={"backplate": str(other)})}) == 3
+
+
 def test_a_picture_that_is_gone_is_told_when_the_job_is_planned(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError, match=r"cannot read the picture .*gone\.hdr: No such file"):
         frame_digest(set={"hdri": str(tmp_path / "gone.hdr")})

@@ -66,6 +66,46 @@ def test_a_picture_that_cannot_be_read_is_refused_before_any_work(tmp_path, writ
     assert error.startswith(f"film.toml:10 set.hdri: {expected.format(folder=tmp_path)}")
 
 
+@pytest.mark.parametrize("name", ["photo.jpg", "photo.png"])
+def test_a_backplate_passes_and_is_kept_with_the_job(tmp_path, name):
+    Image.new("RGB", (320, 180), (200, 80, 20)).save(tmp_path / name)
+    assert problems(tmp_path, f'backplate = "{name}"') == ([], [])
+    loaded, content = read_job(tmp_path / "film.toml"), (tmp_path / name).read_bytes()
+    assert loaded.job.set.backplate == str(tmp_path / name)
+    layout = JobLayout(tmp_path / "renders" / "film")
+    _, text = keep_inputs(loaded, layout)
+    layout.job_file.write_text(text)
+    (tmp_path / name).unlink()
+    assert Path(load_job(layout.job_file).set.backplate or "").read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        ("phot.jpg", 'no such file: {folder}/phot.jpg; did you mean "photo.jpg"?'),
+        ("text.jpg", "{folder}/text.jpg: is no JPEG or PNG picture"),
+        ("photo.webp", "{folder}/photo.webp: is no JPEG or PNG picture"),
+        ("short.jpg", "{folder}/short.jpg: cannot be decoded"),
+        ("print.jpg", "{folder}/print.jpg: has CMYK colours; save it as RGB"),
+        ("turned.jpg", "{folder}/turned.jpg: is stored turned (EXIF orientation 6); save it upright"),
+    ],
+)
+def test_a_backplate_that_cannot_be_read_as_it_is_meant_is_refused(tmp_path, written, expected):
+    pixels = np.random.default_rng(2).integers(0, 255, (180, 320, 3), dtype=np.uint8)
+    photo = Image.fromarray(pixels)
+    for name in ("photo.jpg", "photo.webp"):
+        photo.save(tmp_path / name)
+    photo.convert("CMYK").save(tmp_path / "print.jpg")
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    photo.save(tmp_path / "turned.jpg", exif=turned)
+    whole = (tmp_path / "photo.jpg").read_bytes()
+    (tmp_path / "short.jpg").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.jpg").write_text("this is no picture")
+    (error,), _ = problems(tmp_path, f'backplate = "{written}"')
+    assert error.startswith(f"film.toml:10 set.backplate: {expected.format(folder=tmp_path)}")
+
+
 SIDES = '[domain]\nmin = [-1, -1, 0]\nmax = [1, 1, 1]\nopen_faces = ["x-", "x+", "y-", "y+"]'
 
 
@@ -75,6 +115,9 @@ SIDES = '[domain]\nmin = [-1, -1, 0]\nmax = [1, 1, 1]\nopen_faces = ["x-", "x+",
         ('hdri = "noon.hdr"\nname = "outdoor"', "11 set.name: has no effect beside hdri"),
         ("rotation_deg = 20", "10 set.rotation_deg: has no effect without hdri"),
         ('hdri = "square.hdr"', "10 set.hdri: is 8 x 8 pixels; a picture of the whole sphere is twice as wide"),
+        ('backplate = "square.png"', "10 set.backplate: is 64 x 64 pixels; 44 % of it is cut off to fill 1280 x 720"),
+        ('backplate = "photo.png"\n[camera]\norbit_deg_per_s = 5.0', "10 set.backplate: stands still behind a camera"),
+        ('backplate = "photo.png"\nground = "wood"', "11 set.ground: is seen in reflections only, as backplate"),
         ('background = "plain"\nground = "wood"', '11 set.ground: is seen in reflections only ... "plain"'),
         (f"tank = true\n{SIDES}", "10 set.tank: has no effect, as all sides of the domain are open"),
     ],
@@ -82,6 +125,8 @@ SIDES = '[domain]\nmin = [-1, -1, 0]\nmax = [1, 1, 1]\nopen_faces = ["x-", "x+",
 def test_keys_of_a_set_without_effect_are_warned_of(tmp_path, keys, expected):
     write_hdr(tmp_path / "noon.hdr", np.ones((8, 16, 3)))
     write_hdr(tmp_path / "square.hdr", np.ones((8, 8, 3)))
+    Image.new("RGB", (64, 64)).save(tmp_path / "square.png")
+    Image.new("RGB", (64, 36)).save(tmp_path / "photo.png")
     errors, (warning,) = problems(tmp_path, keys)
     assert errors == []
     assert says(warning, f"film.toml:{expected}")
@@ -94,10 +139,13 @@ def test_keys_of_a_set_without_effect_are_warned_of(tmp_path, keys, expected):
         ('name = "night"\nsun_elevation_deg = 20', '11 set.sun_elevation_deg: ... "night", which has no sun'),
         ("sun_azimuth_deg = 20", '10 set.sun_azimuth_deg: ... "studio", which has no sun'),
         ('hdri = "noon.hdr"\nsun_azimuth_deg = 20', "11 set.sun_azimuth_deg: has no effect beside hdri"),
+        ('backplate = "photo.png"\nbackground = "plain"', '9 set: ... "plain" leaves no place for backplate'),
+        ('backplate = "photo.png"\n[render]\nformat = "png16"', '10 set.backplate: ... 8 bits ... "png16"'),
         ('background = "plain"\n[render]\nformat = "png16"', '10 set.background: is "plain" ... 8 bits ... "png16"'),
     ],
 )
 def test_keys_of_a_set_that_contradict_each_other_are_refused(tmp_path, keys, expected):
+    Image.new("RGB", (64, 36)).save(tmp_path / "photo.png")
     write_hdr(tmp_path / "noon.hdr", np.ones((8, 16, 3)))
     (error,), _ = problems(tmp_path, keys)
     assert says(error, f"film.toml:{expected}")

@@ -97,7 +97,7 @@ def test_a_plate_thinner_than_the_particles_can_hold_is_warned_of(thickness, is_
 def test_the_mass_of_a_block_is_told_beside_that_of_its_volume(tmp_path):
     cube = WATER.replace("[1.0, 1.0, 0.2]", "[0.3, 0.3, 0.3]").replace("0.1]", "0.5]")
     _, _, findings = checked(HEAD + cube, tmp_path / "tank.toml")
-    (fact,) = findings.facts
+    fact = findings.facts[0]
     assert fact.path == ("fluid", 0, "block", 0)
     made = findings.elements["fluid"] * 1000.0 * 0.04**3
     assert fact.message == f"holds {made:.3g} kg of water, 27 kg by its volume"

@@ -1,0 +1,44 @@
+"""How dense looks are by themselves, and what that does to light."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from blender_scripts.look_table import LOOK_TABLE
+from blender_scripts.optics import HONEY_TINT, INSIDES, per_metre, usual_density
+
+LIQUIDS = ("water", "honey")
+
+
+def transmitted(look: str, size: float, density: float, color=None) -> np.ndarray:
+    """Part of red, green and blue light that gets across a body."""
+    return np.exp(-size * np.array(per_metre(look, density, color)))
+
+
+def test_every_look_that_has_a_density_has_one_by_itself():
+    assert set(INSIDES) == {name for name, row in LOOK_TABLE.items() if "density" in row.keys}
+
+
+@pytest.mark.parametrize("size", [0.03, 1.0, 40.0])
+@pytest.mark.parametrize("look", LIQUIDS)
+def test_a_colour_is_what_white_light_becomes_across_the_body_whatever_its_size(look, size):
+    wine = (0.45, 0.03, 0.05)
+    np.testing.assert_allclose(transmitted(look, size, usual_density(look, size, wine), wine), wine, rtol=1e-4)
+
+
+@pytest.mark.parametrize("look", sorted(INSIDES))
+def test_bodies_of_all_sizes_are_as_deep_as_each_other(look):
+    depths = [size * np.array(per_metre(look, usual_density(look, size))) for size in (0.01, 0.3, 25.0)]
+    np.testing.assert_allclose(depths, np.broadcast_to(depths[0], (3, 3)), rtol=1e-4)
+    assert 0.5 < max(depths[0])  # it is seen
+
+
+def test_densities_mean_what_they_meant():
+    assert per_metre("water", 3.0) == pytest.approx((0.9, 0.165, 0.027))
+    # Over a metre of water ten times exaggerated; a centimetre of honey; an extinction.
+    np.testing.assert_allclose(transmitted("water", 1.0, 10.0, (0.5, 0.02, 0.3)), (0.5, 0.02, 0.3))
+    np.testing.assert_allclose(transmitted("honey", 0.01, 1.0), HONEY_TINT)
+    assert transmitted("smoke", 2.0, 0.5)[0] == pytest.approx(math.exp(-1.0))
