@@ -80,7 +80,9 @@ def write_scene(folder: Path, frames: list[int], options: argparse.Namespace) ->
         camera=Camera.on(path, f_stop=None, views=""),
         set=SetParameters(),
         objects=(
-            MeshSequenceObject(name="water", file="water{frame}.ply", material=MaterialParameters(look="water", density=4.0)),
+            MeshSequenceObject(
+                name="water", file="water{frame}.ply", material=MaterialParameters(look="water", density=4.0)
+            ),
             VolumeSequenceObject(
                 name="smoke",
                 file="smoke{frame}.vdb",

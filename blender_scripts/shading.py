@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
@@ -78,8 +79,9 @@ class LookContext:
         """Numbers from -1 to 1 by the name of the body, its parts included: the same in every process and frame."""
         if not self.name:
             return [0.0] * count
-        digest = hashlib.blake2b(self.name.partition(".")[0].encode(), digest_size=2 * count).digest()
-        return [2.0 * int.from_bytes(digest[2 * place : 2 * place + 2], "big") / 65535.0 - 1.0 for place in range(count)]
+        body = self.name.partition(".")[0].encode()
+        words = struct.unpack(f">{count}H", hashlib.blake2b(body, digest_size=2 * count).digest())
+        return [word / 32767.5 - 1.0 for word in words]
 
     def own_shade(self, color: Color, *, brightness: float, warmth: float) -> Color:
         """The body's own shade of a colour: so many stops brighter or darker at most, and warmer or cooler."""

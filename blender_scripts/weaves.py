@@ -70,14 +70,16 @@ DENIM = Weave(4, 1, 1, 0.8e-3, (0.012, 0.030, 0.100), (0.15, 0.16, 0.18), 0.9, 0
 RESOLVED, UNRESOLVED = 0.5, 1.0
 """Threads per pixel: up to the first, Nyquist's, threads are drawn as they are; from the second on there are none."""
 
-_BOLT = 50.0  # how far apart the noises of two cloths may be [its features]
+_BOLT = 2000.0  # threads on both sides of the middle of the bolt that cloths are cut from
 
 HALF_UNDULATION = 0.5  # how far a thread goes up and down, in its radii
 
 
 def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
     spacing = or_default(context.thread_spacing, weave.thread_spacing)
-    u, v = _thread_numbers(builder, spacing)
+    # No two cloths come from the same place of a bolt; threads cross in the same way there.
+    first = weave.period * round(_BOLT / weave.period * context.own_numbers(1)[0])
+    u, v = _thread_numbers(builder, spacing, first)
     warp_height, weft_height = _heights(builder, weave, u, v)
     height = builder.math("MAXIMUM", warp_height, weft_height)
     shows_weft = builder.math("GREATER_THAN", weft_height, warp_height)
@@ -87,9 +89,7 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
     dyed = partial(context.own_shade, brightness=0.12, warmth=0.04)
     weft = None if weave.weft is None else dyed(weave.weft)
     color = _colors(builder, or_default(context.color, dyed(weave.warp)), weft, shown_weft)
-    (place,) = context.own_numbers(1)
-    bolt = _BOLT * place
-    light = _faded(builder, _brightness(builder, weave, height, u, v, bolt), brightness, detail)
+    light = _faded(builder, _brightness(builder, weave, height, u, v), brightness, detail)
     color = builder.scaled(color, light)
     strength = builder.math("MULTIPLY", detail, 0.7)
     bump = builder.node("ShaderNodeBump", Distance=0.5 * spacing, Strength=strength, Height=height)
@@ -153,12 +153,13 @@ def _faded(builder: NodeBuilder, value: Any, mean: float, detail: Any) -> Any:
     return builder.math("MULTIPLY_ADD", builder.math("SUBTRACT", value, mean), detail, mean)
 
 
-def _thread_numbers(builder: NodeBuilder, spacing: float) -> tuple[Any, Any]:
-    """u and v: where a point is, counted in threads."""
+def _thread_numbers(builder: NodeBuilder, spacing: float, first: float = 0.0) -> tuple[Any, Any]:
+    """u and v: where a point is, counted in threads of the bolt, of which `first` is the sheet's first."""
     coordinates = builder.node("ShaderNodeUVMap")
     coordinates.uv_map = REST_UV
     s, t, _ = builder.split(coordinates.outputs[0])
-    return builder.math("DIVIDE", s, spacing), builder.math("DIVIDE", t, spacing)
+    u, v = (builder.math("MULTIPLY_ADD", each, 1.0 / spacing, first) for each in (s, t))
+    return u, v
 
 
 def _heights(builder: NodeBuilder, weave: Weave, u: Any, v: Any) -> tuple[Any, Any]:
@@ -192,18 +193,18 @@ def _colors(builder: NodeBuilder, warp: Color, weft: Color | None, shows_weft: A
     return builder.mix_colors(shown, warp, weft or warp)
 
 
-def _brightness(builder: NodeBuilder, weave: Weave, height: Any, u: Any, v: Any, bolt: float) -> Any:
-    """A factor on colours, which are uneven along threads, differently in each bolt, and darker between them."""
+def _brightness(builder: NodeBuilder, weave: Weave, height: Any, u: Any, v: Any) -> Any:
+    """A factor on colours, which are uneven along threads and darker between them."""
     # Thick and thin places of a thread are some forty spacings long.
-    uneven = builder.math("ADD", _streaks(builder, u, 1.0, v, 0.025, bolt), _streaks(builder, u, 0.025, v, 1.0, bolt))
+    uneven = builder.math("ADD", _streaks(builder, u, 1.0, v, 0.025), _streaks(builder, u, 0.025, v, 1.0))
     uneven = builder.math("MULTIPLY_ADD", builder.math("SUBTRACT", uneven, 1.0), 2.0 * weave.unevenness, 1.0)
     light = builder.math("MINIMUM", builder.math("MULTIPLY_ADD", height, 1.0 - weave.gaps, weave.gaps), 1.0)
     return builder.math("MULTIPLY", uneven, builder.math("MAXIMUM", light, 0.0))
 
 
-def _streaks(builder: NodeBuilder, u: Any, u_scale: float, v: Any, v_scale: float, bolt: float) -> Any:
+def _streaks(builder: NodeBuilder, u: Any, u_scale: float, v: Any, v_scale: float) -> Any:
     """Noise [0, 1] about 0.5 that is drawn out along one direction of threads."""
-    place = builder.combined(builder.math("MULTIPLY", u, u_scale), builder.math("MULTIPLY", v, v_scale), bolt)
+    place = builder.combined(builder.math("MULTIPLY", u, u_scale), builder.math("MULTIPLY", v, v_scale))
     return builder.noise(place, Scale=0.7, Detail=2.0)
 
 

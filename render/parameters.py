@@ -240,7 +240,6 @@ class SetParameters(Parameters):
         default=False, description="Show the domain's walls as a glass tank; its open_faces have no pane."
     )
 
-
     @property
     def is_seen(self) -> bool:
         """Whether ground and sky themselves are in the picture."""

@@ -76,7 +76,8 @@ def box_of(placement: Placement) -> Box:
     from sim.shapes.placement import build_solid
 
     box = BoxShape(type="box", size=measures_of(placement).edges)
-    return build_solid(placement.model_copy(update={"shape": box, "scale": 1.0})).bounds
+    bounds: Box = build_solid(placement.model_copy(update={"shape": box, "scale": 1.0})).bounds
+    return bounds
 
 
 # --- sizes of looks ---

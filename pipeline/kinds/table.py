@@ -106,7 +106,7 @@ def scene_boxes(job: Job) -> NDArray[np.float64]:
     beside = [box for _, kind, body in bodies(job) for box in kind.boxes(job, body)]
     low, high = domain[0] - reach, domain[1] + reach
     near = [box for box in beside if (box >= low).all() and (box <= high).all() and box[1, 2] > domain[0, 2]]
-    boxes = np.stack([domain, *near])
+    boxes: NDArray[np.float64] = np.stack([domain, *near])
     boxes[..., 2] = np.maximum(boxes[..., 2], domain[0, 2])
     return boxes
 

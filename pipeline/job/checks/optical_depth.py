@@ -24,34 +24,33 @@ def check_optical_depths(job: Job, findings: Findings) -> None:
             _check(job, path, kind, body, material, findings=findings)
 
 
-def _check(
-    job: Job, path: KeyPath, kind: Kind, body: Any, material: MaterialParameters, *, findings: Findings
-) -> None:
+def _check(job: Job, path: KeyPath, kind: Kind, body: Any, material: MaterialParameters, *, findings: Findings) -> None:
     assert material.look is not None
-    size, inside = kind.look_size(job, body), INSIDES[material.look]
+    size, is_smoke = kind.look_size(job, body), kind.wears == "smoke"
     usual = usual_density(material.look, size, material.color)
     density = usual if material.density is None else material.density
     depths = [size * each for each in per_metre(material.look, density, material.color)]
     is_grey = max(depths) == min(depths)
     written = f"{depths[0]:.2g}" if is_grey else " / ".join(f"{each:.2g}" for each in depths) + " (red / green / blue)"
-    across = "across its source" if kind.wears == "smoke" else f"across {size:.2g} m"
+    across = "across its source" if is_smoke else f"across {size:.2g} m"
     findings.facts.append(
         Problem(path, f'"{body.name}" as {material.look}: optical depth {written} {across}, density {density:.3g}')
     )
     if material.density is None:
         return  # the job's own colour may be meant to be clear
-    at: KeyPath = (*_table_of(job, body.name), "density")
-    remedy = f"omit it, which is {usual:.2g} here"
     if max(depths) < LEAST_DEPTH:
-        what = "the smoke" if kind.wears == "smoke" else "the tint"
-        findings.warn(
-            at, f'{density:g} gives "{body.name}" an optical depth of {max(depths):.2g}: {what} is not seen; {remedy}'
-        )
-    elif min(depths) > (WALL_DEPTH if inside.scatters else TAR_DEPTH) and material.look != "milk":
-        what = "it looks solid" if inside.scatters else "it is as black as tar"
-        findings.warn(
-            at, f'{density:g} gives "{body.name}" an optical depth of {min(depths):.2g}: {what}; {remedy}'
-        )
+        outcome = "the smoke is not seen" if is_smoke else "the tint is not seen"
+    elif is_smoke and min(depths) > WALL_DEPTH:
+        outcome = "it looks solid"
+    elif not INSIDES[material.look].scatters and min(depths) > TAR_DEPTH:
+        outcome = "it is as black as tar"
+    else:
+        return
+    findings.warn(
+        (*_table_of(job, body.name), "density"),
+        f'{density:g} gives "{body.name}" an optical depth of {max(depths):.2g}: {outcome}; omit it, which is '
+        f"{usual:.2g} here",
+    )
 
 
 def _table_of(job: Job, name: str) -> KeyPath:

@@ -45,7 +45,7 @@ def check_set(job: Job, findings: Findings) -> None:
         other = "backplate" if parameters.backplate is not None else f'background = "{parameters.background}"'
         findings.warn(("set", "ground"), f"is seen in reflections only, as {other} leaves it out")
     if job.render.format == "png16" and (parameters.background == "plain" or parameters.backplate is not None):
-        key, what = ("backplate", "is what") if parameters.backplate is not None else ("background", 'is "plain", which')
+        key, what = ("background", 'is "plain", which') if parameters.backplate is None else ("backplate", "is what")
         findings.error(
             ("set", key), f'{what} pictures are laid over in 8 bits, but render.format is "png16"; take "png"'
         )
@@ -99,8 +99,7 @@ def _check_backplate(job: Job, path: Path, findings: Findings) -> None:
     if shown < LEAST_SHOWN:
         findings.warn(
             key,
-            f"is {width} x {height} pixels; {100.0 * (1.0 - shown):.0f} % of it is cut off to fill "
-            f"{columns} x {rows}",
+            f"is {width} x {height} pixels; {100.0 * (1.0 - shown):.0f} % of it is cut off to fill {columns} x {rows}",
         )
     if job.camera.moves:
         findings.warn(key, "stands still behind a camera that moves")

@@ -165,7 +165,9 @@ def test_a_camera_without_a_place_shows_domain_smoke_and_bodies_beside_it():
     }
     boxes = scene_boxes(job(**beyond))
     # The slab is ground.
-    np.testing.assert_allclose([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)], [[-1.2, -0.5, 0.0], [0.95, 0.5, 1.6]])
+    np.testing.assert_allclose(
+        [boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)], [[-1.2, -0.5, 0.0], [0.95, 0.5, 1.6]]
+    )
     view = render_spec(job(**beyond), LAYOUT).camera
     corners = np.array([[x, y, z] for box in boxes for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
     screen = screen_positions(view, corners, aspect=16 / 9)

@@ -106,6 +106,12 @@ def test_a_backplate_that_cannot_be_read_as_it_is_meant_is_refused(tmp_path, wri
     assert error.startswith(f"film.toml:10 set.backplate: {expected.format(folder=tmp_path)}")
 
 
+def test_a_backplate_beside_another_background_is_refused(tmp_path):
+    Image.new("RGB", (64, 36)).save(tmp_path / "photo.png")
+    with pytest.raises(JobFileError, match=r'film\.toml:9 set: background = "plain" leaves no place for backplate'):
+        problems(tmp_path, 'backplate = "photo.png"\nbackground = "plain"')
+
+
 SIDES = '[domain]\nmin = [-1, -1, 0]\nmax = [1, 1, 1]\nopen_faces = ["x-", "x+", "y-", "y+"]'
 
 
@@ -139,7 +145,6 @@ def test_keys_of_a_set_without_effect_are_warned_of(tmp_path, keys, expected):
         ('name = "night"\nsun_elevation_deg = 20', '11 set.sun_elevation_deg: ... "night", which has no sun'),
         ("sun_azimuth_deg = 20", '10 set.sun_azimuth_deg: ... "studio", which has no sun'),
         ('hdri = "noon.hdr"\nsun_azimuth_deg = 20', "11 set.sun_azimuth_deg: has no effect beside hdri"),
-        ('backplate = "photo.png"\nbackground = "plain"', '9 set: ... "plain" leaves no place for backplate'),
         ('backplate = "photo.png"\n[render]\nformat = "png16"', '10 set.backplate: ... 8 bits ... "png16"'),
         ('background = "plain"\n[render]\nformat = "png16"', '10 set.background: is "plain" ... 8 bits ... "png16"'),
     ],
