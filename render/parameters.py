@@ -269,7 +269,8 @@ class MaterialParameters(Parameters):
     density: Positive | None = Field(
         default=None,
         description="Smoke and fire: extinction per metre at density 1 [1/m]. Factor on the absorption of "
-        "water, on the absorption and scattering of honey, on the scattering of milk [-].",
+        "water, on the absorption and scattering of honey, on the scattering of milk [-]. By the body's size if "
+        "omitted.",
     )
     caustics: bool = Field(
         default=False,
