@@ -208,7 +208,7 @@ def test_bodies_of_one_look_differ_by_their_names_and_by_nothing_else(look, tmp_
     assert np.abs(patch(first, 0.0, 0.5, 0.2) - patch(other, 0.0, 0.5, 0.2)).mean() > 2.0
 
 
-def test_the_ground_and_what_the_job_says_of_metal_are_the_same_for_all_names(tmp_path):
+def test_what_the_job_says_of_metal_is_the_same_for_all_names(tmp_path):
     write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.3))
     brass = MaterialParameters(look="metal", color=(0.8, 0.6, 0.3), roughness=0.2)
     one, two = (
