@@ -63,15 +63,18 @@ class Inside:
     scatters: bool = False
 
 
-_SMOKE = Inside(lambda _color: (1.0, 1.0, 1.0), true_size=2.0, tinted_size=2.0, scatters=True)
+def _smoke(_color: Color | None) -> Color:
+    return 1.0, 1.0, 1.0
+
 
 INSIDES: dict[str, Inside] = {
     # Nobody sees the blue of a glass of water: what is two metres across looks as it is, all else as blue as that.
     "water": Inside(_water, true_size=2.2, tinted_size=10.0),
     "honey": Inside(_honey, true_size=0.025, tinted_size=0.01),
     "milk": Inside(_milk, true_size=0.15, tinted_size=0.15, scatters=True),
-    "smoke": _SMOKE,
-    "fire": _SMOKE,
+    # A plume soon has a part of its source's density, and is seen so far; flames are thin.
+    "smoke": Inside(_smoke, true_size=2.5, tinted_size=2.5, scatters=True),
+    "fire": Inside(_smoke, true_size=2.0, tinted_size=2.0, scatters=True),
 }
 """Every look that has a density."""
 

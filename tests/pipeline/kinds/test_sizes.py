@@ -112,12 +112,12 @@ def test_each_body_has_a_density_of_its_own_size():
         smoke=[PLUME],
         material={"wine": {"color": [0.5, 0.02, 0.03]}, "clear": {"density": 0.25}},
     )
-    # A tint is seen across the body; the blue of water is that of 2.2 m; a source of 0.1 m has a depth of 2.
+    # A tint is seen across the body; the blue of water is that of 2.2 m; a source of 0.1 m has a depth of 2.5.
     assert densities(scene) == {
         "water": pytest.approx(2.2 / 0.4, rel=1e-5),
         "wine": pytest.approx(10.0 / 0.2, rel=1e-5),
         "clear": 0.25,
-        "plume": pytest.approx(20.0, rel=1e-5),
+        "plume": pytest.approx(25.0, rel=1e-5),
     }
 
 

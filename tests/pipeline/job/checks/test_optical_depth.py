@@ -42,14 +42,14 @@ def test_the_optical_depth_of_each_liquid_and_smoke_is_told(tmp_path):
     of_looks = [fact for fact in facts if "optical depth" in fact]
     assert of_looks == [
         '"water" as water: optical depth 0.66 / 0.12 / 0.02 (red / green / blue) across 0.4 m, density 5.5',
-        '"plume" as smoke: optical depth 2 across its source, density 10',
+        '"plume" as smoke: optical depth 2.5 across its source, density 12.5',
     ]
 
 
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
-        ("plume.density = 0.3", '0.3 gives "plume" ... 0.06: the smoke is not seen; omit it, which is 10 here'),
+        ("plume.density = 0.3", '0.3 gives "plume" ... 0.06: the smoke is not seen; omit it, which is 12 here'),
         ("plume.density = 200.0", '200 gives "plume" ... 40: it looks solid; omit it'),
         ("water.density = 0.5", '0.5 gives "water" ... 0.06: the tint is not seen; omit it, which is 5.5 here'),
         ('water = { look = "honey", density = 1.0 }', '1 gives "water" ... 1.2e+02: it is as black as tar; omit it'),
