@@ -29,6 +29,8 @@ TURNS_FROM_DEG = 45.0
 NEAREST_FOCUS_M = 1.0e-3
 RIM_POINTS = 32
 VIEWS_VERSION = 1
+FRAMING_VERSION = 2
+"""Raised when a camera frames the same points from elsewhere."""
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,7 @@ class GltfExport(ExportStage):
                 tools={},
                 objects=spec.model_dump(mode="json", include={"objects"})["objects"],
                 camera=job.placed_camera.model_dump(mode="json"),
+                first_view=spec.camera.model_dump(mode="json"),
                 resolution=spec.render.resolution,
                 fps=job.fps,
                 frames=frames,

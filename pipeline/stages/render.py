@@ -26,6 +26,7 @@ from pipeline.stages.texture_memory import own_picture_bytes
 from pipeline.stages.visibility import bodies_at, warn_if_invisible
 from render.blend_file import read_material_names
 from render.blender import BlenderDiedError, BlenderUnavailableError, require_bpy, require_supported_executable
+from render.camera_path import FRAMING_VERSION
 from render.errors import InvalidFileError
 from render.meshes import read_ply
 from render.pictures import validate_exr
@@ -77,7 +78,7 @@ class RenderStage(Stage):
         spec = decisive(drawn)
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
-            spec["camera"] = {"framing": job.placed_camera.model_dump(mode="json")}
+            spec["camera"] = {"framing": job.placed_camera.model_dump(mode="json"), "version": FRAMING_VERSION}
         elif job.placed_camera.moves:
             spec["camera"]["path"] = job.placed_camera.model_dump(mode="json", exclude={"framing"})
         parameters = ParameterSet.of(

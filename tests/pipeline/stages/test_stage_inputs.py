@@ -89,6 +89,16 @@ def test_a_backplate_counts_by_what_is_in_it_and_a_set_without_one_as_before(tmp
     assert len({street, frame_digest(), frame_digest(set={"backplate": str(other)})}) == 3
 
 
+def test_frames_whose_camera_frames_the_action_count_how_it_does_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it stands follows from the film, so that no number of the job says it."""
+    cameras: tuple[dict[str, object], ...] = ({"framing": "action"}, {"position": [0.0, -3.0, 1.0]})
+    before = [frame_digest(camera=camera) for camera in cameras]
+    monkeypatch.setattr("pipeline.stages.render.FRAMING_VERSION", 99)
+    after = [frame_digest(camera=camera) for camera in cameras]
+    assert before[0] != after[0]
+    assert before[1] == after[1]
+
+
 def test_a_picture_that_is_gone_is_told_when_the_job_is_planned(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError, match=r"cannot read the picture .*gone\.hdr: No such file"):
         frame_digest(set={"hdri": str(tmp_path / "gone.hdr")})
