@@ -212,7 +212,7 @@ def gather_sample_forces(near: NearParticles, exerted: Exerted, force: Vectors):
                 rho0 = fluid.materials.rest_density[own]
                 mu = LAPLACIAN_FACTOR * fluid.materials.dynamic_viscosity[own]
                 v_dot_x = (particles.velocity[i] - v_b).dot(x_ib)
-                viscous = viscous_factor(v_dot_x, r_squared, viscosity.softening, mu, viscosity.artificial * rho0)
+                viscous = viscous_factor(v_dot_x, r_squared, viscosity, mu, rho0)
                 scale -= viscosity.wall_friction * viscous / particles.density[i]
             total += scale * spline_slope(r * fluid.inverse_support) / (r + TINY_DISTANCE) * x_ib
         force[b] = exerted.volume_gradient_factor * samples.volume[near.first + b] * total

@@ -85,7 +85,12 @@ class DFSPHSolver(IncompressibleFluid):
         carried, tolerance = self.particles.carried, self.parameters.density_tolerance
         self.start_from(carried["pressure"])
         carried["pressure"] = self.solve(
-            self.solves["density"], carried["pressure"], dt, least=LEAST_ITERATIONS, tolerance=tolerance
+            self.solves["density"],
+            carried["pressure"],
+            dt,
+            least=LEAST_ITERATIONS,
+            tolerance=tolerance,
+            aim=self.quiet_error(dt),
         )
         self.forces.react(carried["pressure"], dt)
         add_scaled(self.forces.acceleration, self.pressure_acceleration, 1.0, self.particles.count)

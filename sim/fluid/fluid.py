@@ -95,7 +95,12 @@ class SPHFluid(ABC):
         self.gravity, self.spacing = start.gravity, self.discretization.spacing
         self.particle_volume = self.discretization.particle_volume
         self.forces = Forces(
-            self.tank, self.phases, self.cohesion, signal_speed=self.signal_speed, with_implicit=with_implicit
+            self.tank,
+            self.phases,
+            self.cohesion,
+            signal_speed=self.signal_speed,
+            speed_ratio=self.speed_ratio,
+            with_implicit=with_implicit,
         )
         self.solves = {name: SolveRecord() for name in self.solved_for}
         if self.forces.implicit_viscosity is not None:

@@ -1,5 +1,6 @@
 """Forces on the particles, whatever the solver finds their pressure by, and their reaction on bodies and sheets."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ from sim.fluid.sheets import DENSITY
 from sim.fluid.surface_tension import Cohesion, SurfaceTensionAkinci2013, cohesion_becker_teschner2007
 from sim.fluid.tank import ParticleTank
 from sim.fluid.viscosity import (
+    CALM_SPEED,
+    CALMING,
     LAPLACIAN_FACTOR,
     SOFTENING,
     ImplicitViscosity,
@@ -46,22 +49,41 @@ class Forces:
 
     Attributes:
         acceleration: of each particle [m/s²], (capacity,) of 3-vectors.
-        artificial_viscosity: alpha c h/2 [m²/s], which stands where 2 (d + 2) nu does.
+        artificial_viscosity: alpha c h/2 at most [m²/s], which stands where 2 (d + 2) nu does.
         implicit_viscosity: the solve for stiff fluids; None where viscosity is explicit.
     """
 
     def __init__(
-        self, tank: ParticleTank, phases: Phases, cohesion: Cohesion, *, signal_speed: float, with_implicit: bool
+        self,
+        tank: ParticleTank,
+        phases: Phases,
+        cohesion: Cohesion,
+        *,
+        signal_speed: float,
+        speed_ratio: float,
+        with_implicit: bool,
     ) -> None:
-        """Prepare for the particles of a tank; `signal_speed` is c in the artificial viscosity [m/s]."""
+        """Prepare for the particles of a tank; `signal_speed` is c in the artificial viscosity [m/s].
+
+        `speed_ratio` is that speed over the largest expected one [-].
+        """
         self._tank, self._cohesion = tank, cohesion
         parameters, d = phases.shared, tank.discretization
         support, capacity = d.support_radius, tank.particles.capacity
         self.acceleration = ti.Vector.ndarray(3, ti.f32, capacity)
-        self.artificial_viscosity = parameters.artificial_viscosity * signal_speed * support / 2.0
-        wall_friction = parameters.wall_friction
+        wall_friction, smoothing_length = parameters.wall_friction, support / 2.0
+        artificial = parameters.artificial_viscosity * signal_speed * smoothing_length
+        fall_speed = math.sqrt(float(np.linalg.norm(tank.gravity)) * d.spacing)
+        at_rest = CALMING * speed_ratio * fall_speed * smoothing_length
+        calming = max(at_rest - artificial, 0.0) if artificial > 0.0 else 0.0
+        self.artificial_viscosity = artificial + calming
         self._viscosity = Viscosity(
-            SOFTENING * support**2, self.artificial_viscosity, wall_friction, wall_friction > 0.0
+            softening=SOFTENING * support**2,
+            artificial=artificial,
+            calming=calming,
+            calm_speed_squared=(CALM_SPEED * fall_speed) ** 2,
+            wall_friction=wall_friction,
+            with_wall_friction=wall_friction > 0.0,
         )
         self._volume_gradient_factor = d.particle_volume * d.sigma / support
         self._explicit_materials = phases.materials
@@ -139,7 +161,7 @@ class Forces:
         if solver is None:
             return
         fluid, body_forces = tank.on_device, tank.body_forces
-        viscosity = self._viscosity._replace(artificial=0.0)
+        viscosity = self._viscosity._replace(artificial=0.0, calming=0.0)
 
         def friction_at(velocity: ti.Ndarray, sample_velocity: ti.Ndarray) -> Exerted:
             particles = fluid.particles._replace(velocity=velocity)
@@ -201,7 +223,7 @@ def compute_acceleration(
                 alike = ti.cast(other == own, ti.f32)
                 mu_ij = pair_viscosity(mu, LAPLACIAN_FACTOR * materials.dynamic_viscosity[other])
                 rho0_ij = 0.5 * (rho0 + materials.rest_density[other])
-            viscous = viscous_factor(v_dot_x, r_squared, viscosity.softening, mu_ij, viscosity.artificial * rho0_ij)
+            viscous = viscous_factor(v_dot_x, r_squared, viscosity, mu_ij, rho0_ij)
             scale = 2.0 * viscous / (rho_i + particles.density[j])
             if ti.static(elastic.is_given):
                 scale -= pressure_i + elastic.pressure_term[j]
@@ -230,9 +252,7 @@ def compute_acceleration(
                 v_ib = v_i
                 if ti.static(fluid.samples.with_moving):
                     v_ib -= samples.velocity[b]
-                viscous = viscous_factor(
-                    v_ib.dot(x_ib), r_squared, viscosity.softening, mu, viscosity.artificial * rho0
-                )
+                viscous = viscous_factor(v_ib.dot(x_ib), r_squared, viscosity, mu, rho0)
                 boundary_sum += (
                     viscosity.wall_friction * viscous / rho_i * samples.friction_volume[b] * slope * inverse_r * x_ib
                 )

@@ -108,7 +108,14 @@ class PCISPHSolver(IncompressibleFluid):
         self.start_from(carried["pressure"])
         pressure, least, tolerance = carried["pressure"], LEAST_ITERATIONS, self.parameters.density_tolerance
         carried["pressure"] = self.solve(
-            record, pressure, dt, least=least, tolerance=tolerance, error_growth=error_growth, relax=relax
+            record,
+            pressure,
+            dt,
+            least=least,
+            tolerance=tolerance,
+            aim=self.quiet_error(dt),
+            error_growth=error_growth,
+            relax=relax,
         )
         return record
 

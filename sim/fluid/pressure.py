@@ -28,6 +28,8 @@ from sim.fluid.tank import FluidStart
 from sim.fluid.traits import CFL_NUMBER, TRAITS, stable_time_step
 
 CORRECTED_PER_CROSSING = 0.5  # of a compression is taken back while the largest expected speed crosses a spacing
+QUIET_ERROR = 0.003  # compression to aim at over the way of the fastest particle in a step in spacings [-]
+LEAST_ERROR = 1.0e-5  # and the least to aim at: smaller ones move nothing that could be seen
 MOST_ITERATIONS_AHEAD = 4  # most iterations from one look at the error to the next
 DISORDER = 1.3  # largest eigenvalue of A over its diagonal at worst, over that of a lattice; 1.26 is measured
 LEAST_DIAGONAL = 1.0e-6  # of a filled neighbourhood's A_ii: below it a particle has no neighbour and no pressure
@@ -115,6 +117,14 @@ class IncompressibleFluid(SPHFluid):
         """
         return min(1.0, CORRECTED_PER_CROSSING * self.expected_speed * dt / self.spacing)
 
+    def quiet_error(self, dt: float) -> float:
+        """Mean compression at which a density solve of dt [s] stops: the tolerance, or less where all is quiet.
+
+        The compression that is left moves particles: of a fluid at rest it would be what moves it.
+        """
+        in_spacings = self.tank.motion.max_speed * dt / self.spacing
+        return min(self.parameters.density_tolerance, max(QUIET_ERROR * in_spacings, LEAST_ERROR))
+
     def predict_compression(self, dt: float) -> None:
         """Compression that a step of dt [s] without pressure leads to, linear in the velocities.
 
@@ -136,6 +146,7 @@ class IncompressibleFluid(SPHFluid):
         *,
         least: int,
         tolerance: float,
+        aim: float | None = None,
         error_growth: float = math.inf,
         relax: Relax | None = None,
     ) -> ti.Ndarray:
@@ -147,10 +158,12 @@ class IncompressibleFluid(SPHFluid):
             dt: the step [s].
             least: iterations to make in any case.
             tolerance: mean compression that may be left [-].
+            aim: that at which it stops, the tolerance if omitted [-].
             error_growth: of the first error, or of ten times the tolerance, at which to give up, not converged [-].
             relax: fills `system.remaining` and `next_pressure`; as the linear system has it if omitted.
         """
         limit = max(self.parameters.max_iterations, least)
+        aim = tolerance if aim is None else aim
         iteration, next_look, bound = 0, least, math.inf
         while True:
             self.accelerate_by(pressure)
@@ -162,12 +175,12 @@ class IncompressibleFluid(SPHFluid):
             iteration += 1
             if iteration >= min(next_look, limit):
                 error = self.mean_error(pressure, dt)
-                if error <= tolerance or iteration >= limit or not error <= bound:
+                if error <= aim or iteration >= limit or not error <= bound:
                     record.add(iteration, error, converged=error <= tolerance)
                     return pressure
                 if math.isinf(bound):
                     bound = error_growth * max(error, 10.0 * tolerance)
-                next_look += iterations_ahead(error, tolerance)
+                next_look += iterations_ahead(error, aim)
             pressure, self.next_pressure = self.next_pressure, pressure
 
     def accelerate_by(self, pressure: ti.Ndarray) -> None:

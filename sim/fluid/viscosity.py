@@ -16,10 +16,13 @@ from sim.fluid.particles import Fluid, Particles, ParticleSet
 from sim.fluid.stepping import SolveRecord
 
 LAPLACIAN_FACTOR = 10.0  # 2 (d + 2) of Monaghan's viscosity in d = 3 dimensions
+CALMING = 3.0  # least artificial viscosity of pairs at rest, over sqrt(g d) h/2 times the ratio of signals' speeds [-]
+CALM_SPEED = 0.01  # over sqrt(g d), of an approach that has half of it [-]: neighbours in a fluid at rest are slower
 SOFTENING = 0.01  # keeps |x_ij|² + 0.01 h² away from zero for particles that meet
 TOLERANCE = 1.0e-3  # where a solve stops: residual over the velocity changes that viscosity asks for, root mean squares
 MAX_ITERATIONS = 200  # a solve that needs more is counted as not converged; its velocities are used as they are
 STAGNATION = 0.5  # of the residual of the restart before: with more left the limits of float32 are met
+TINY_SQUARE = 1.0e-30  # keeps the share of a pair that is at rest, without gravity, from 0/0 [m⁴/s²]
 LEAST_SQUARE = 1.0e-24  # velocity changes whose squares add up to less are nothing, and no reason to iterate [m²/s²]
 CARRIED = ("viscous_change_x", "viscous_change_y", "viscous_change_z")  # of each particle, where the next solve starts
 
@@ -30,12 +33,14 @@ class Viscosity(NamedTuple):
 
     softening: ti.f32  # 0.01 h² [m²]
     artificial: ti.f32  # alpha c_s h/2 [m²/s]
+    calming: ti.f32  # what pairs at rest have more of it [m²/s]
+    calm_speed_squared: ti.f32  # square of the approach that halves this [m²/s²]
     wall_friction: ti.f32  # viscosity against boundaries over that of the fluid [-]
     with_wall_friction: ti.template()  # whether it is above 0
 
 
 @func
-def viscous_factor(v_dot_x: ti.f32, r_squared: ti.f32, softening: ti.f32, mu: ti.f32, artificial: ti.f32) -> ti.f32:
+def viscous_factor(v_dot_x: ti.f32, r_squared: ti.f32, viscosity: Viscosity, mu: ti.f32, rho0: ti.f32) -> ti.f32:
     """Factor on V/(rho_ij/rho0) grad W_ij / rho0 of the viscous acceleration.
 
     Physical part, Monaghan 2005, eq. 8.9 with the constant for three dimensions:
@@ -43,10 +48,15 @@ def viscous_factor(v_dot_x: ti.f32, r_squared: ti.f32, softening: ti.f32, mu: ti
     Artificial part, Monaghan 1992, eq. 4.1 with beta = 0, between particles that approach each other only:
     a_i = alpha c_s h_s sum_j (m_j / rho_ij) min(v_ij . x_ij, 0) / (|x_ij|² + 0.01 h²) grad W_ij,
     with the smoothing length h_s = h/2. Both conserve momentum pair by pair as rho_ij = (rho_i + rho_j)/2. Particles of
-    equal volume V have m_j = rho0 V; so the force holds between two fluids as well. `softening` is 0.01 h² [m²], `mu`
-    2 (d+2) rho0 nu, and `artificial` rho0 alpha c_s h_s [Pa s].
+    equal volume V have m_j = rho0 V; so the force holds between two fluids as well. `mu` is 2 (d+2) rho0 nu [Pa s].
+
+    The slower an approach u the more is added to alpha c_s, by u_c²/(u_c² + u²) of `calming`: what small errors of the
+    pressure move in a fluid at rest has no speed in common, and no scale but the spacing.
     """
-    return (mu * v_dot_x + artificial * ti.min(v_dot_x, 0.0)) / (r_squared + softening)
+    slow = viscosity.calm_speed_squared * r_squared
+    share = slow / (slow + v_dot_x * v_dot_x + TINY_SQUARE)
+    artificial = rho0 * (viscosity.artificial + viscosity.calming * share)
+    return (mu * v_dot_x + artificial * ti.min(v_dot_x, 0.0)) / (r_squared + viscosity.softening)
 
 
 @func
