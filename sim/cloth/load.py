@@ -30,7 +30,7 @@ class NodeLoad:
 
     def take_off(self, state: ClothState) -> None:
         """Give the nodes their own masses back."""
-        state.inverse_mass.copy_from(self._own_inverse)
+        take_off_load(self._own_inverse, state.inverse_mass)
 
 
 @kernel
@@ -51,3 +51,10 @@ def put_on_load(
             with_load = w_n / (1.0 + mass[n] * w_n)
             velocity[n] += with_load * (impulse[n] - dt * mass[n] * gravity)
             inverse_mass[n] = with_load
+
+
+@kernel
+def take_off_load(own_inverse: Floats, inverse_mass: Floats):
+    """The masses that nodes had before."""
+    for n in range(inverse_mass.shape[0]):
+        inverse_mass[n] = own_inverse[n]

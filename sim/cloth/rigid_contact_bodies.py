@@ -9,7 +9,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import CollidingBodies, PushedBodies
-from sim.core.host_access import put, take
+from sim.core.host_access import copied, put, take
 from sim.core.motion.paths import Poses
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.device_shapes import CAPSULE, SPHERE, TORUS, DeviceShapes
@@ -132,13 +132,13 @@ class CollisionBodies(DeviceShapes):
 
         What is sharp, or read from a grid, may show by any height.
         """
-        size, kind = (each.to_numpy()[: self.count] for each in (self.on_device.size, self.on_device.kind))
+        size, kind = (copied(each)[: self.count] for each in (self.on_device.size, self.on_device.kind))
         radius = np.where(kind == TORUS, size[:, 1], size[:, 0])
         return np.where(np.isin(kind, _ROUND), edge**2 / (6.0 * np.maximum(radius, 1.0e-30)), np.inf)
 
     def look_at_triangles(self, shows: NDArray[np.bool_]) -> None:
         """Say which bodies may show between vertices, (b,)."""
-        put(self.shows, np.where(self.on_device.kind.to_numpy()[: self.count] == SPHERE, 1, 2) * shows)
+        put(self.shows, np.where(copied(self.on_device.kind)[: self.count] == SPHERE, 1, 2) * shows)
 
     def set_motion(self, shift: Array, turn: Array) -> None:
         """Say how the bodies would move in a substep without cloth.

@@ -36,7 +36,7 @@ from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
-from sim.core.host_access import add, viewed
+from sim.core.host_access import add, copied, viewed
 from sim.core.parameters import Vector3
 from sim.core.scheduling import is_short
 from sim.core.snapshots import Snapshot
@@ -365,7 +365,7 @@ class ClothSolver:
         """Each cloth: its nodes, and the triangles between them."""
         host = self.state.host
         position = self.state.positions().astype(np.float32)
-        velocity = self.state.velocity.to_numpy()
+        velocity = copied(self.state.velocity)
         snapshots = {}
         for number, cloth in enumerate(self.parameters):
             first, last = host.first_node[number : number + 2]

@@ -15,6 +15,7 @@ from sim.cloth.sheet import Grid, RestSheet
 from sim.cloth.springs import edges_of
 from sim.cloth.start import quantum_of, start_positions
 from sim.core.arrays import Vectors
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 
 
@@ -189,7 +190,7 @@ class ClothState:
 
     def positions(self) -> NDArray[np.float64]:
         """World positions [m], (n, 3) float64."""
-        positions: NDArray[np.float64] = self.lattice.to_numpy() * self.quantum + self.carry.to_numpy()
+        positions: NDArray[np.float64] = copied(self.lattice) * self.quantum + copied(self.carry)
         return positions
 
     def place_displaced(self) -> None:

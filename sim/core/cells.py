@@ -123,6 +123,11 @@ class CellSort:
         dropped = sort_points_by_cell(positions, ids, count, self.grid.on_device, low, high, self._arrays)
         return count - int(dropped)
 
+    @property
+    def arrays(self) -> SortArrays:
+        """For a kernel that sorts by `counting_sort` and does more."""
+        return self._arrays
+
 
 @func
 def cell_of_point(point: ti.math.vec3, grid: Grid) -> Cells:
@@ -147,7 +152,23 @@ def sort_points_by_cell(
     keep_high: ti.math.vec3,
     arrays: SortArrays,
 ) -> ti.i32:
-    """Counting sort; returns how many points were dropped, which are in one cell more than the grid has.
+    """As `counting_sort`."""
+    return counting_sort(positions, ids, count, grid, keep_low, keep_high, arrays)
+
+
+@func
+def counting_sort(
+    positions: Vectors,
+    ids: Integers,
+    count: ti.i32,
+    grid: Grid,
+    keep_low: ti.math.vec3,
+    keep_high: ti.math.vec3,
+    arrays: SortArrays,
+) -> ti.i32:
+    """Sort by cell; returns how many points were dropped, which are in one cell more than the grid has.
+
+    For the outermost level of a kernel: its loops then run in parallel.
 
     Threads race for the places in a cell, the insertion sort settles it.
     """

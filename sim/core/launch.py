@@ -2,7 +2,8 @@
 
 Taichi looks at every argument of every call several times. `FastKernel` has Taichi check the types of a call once, and
 hands the arguments of later calls with the same types straight to the runtime, but for fields of bundles that the
-kernel does not read. On a CPU it also keeps the context of a launch, as most calls come again with the same arrays.
+kernel does not read. Most calls come again with the same arrays, which are known by then: on a GPU with what they are
+to the runtime, on a CPU with the whole context of the launch.
 Measurements: docs/performance.md.
 
 This relies on Taichi's internals, as `sim.core.bundles`, `sim.core.runtime` and `sim.core.reductions` do; the lock file
@@ -39,12 +40,14 @@ def on_compiled(tell: Callable[[str, float], None] | None) -> None:
 
 
 class _Launch(NamedTuple):
-    """A kept launch context, until one of its arrays is gone; `numbers` are what the context has, by argument."""
+    """What is kept of a launch with these arrays, until one of them is gone."""
 
     compiled: Any
-    context: Any
+    make_context: Callable[[], Any]
+    context: Any  # on a CPU
+    numbers: list[Any]  # what that context has, by argument
+    handles: list[tuple[tuple[int], Any]]  # of the arrays, by place; on a GPU
     arrays: tuple[weakref.ref[Any], ...]
-    numbers: list[Any]
 
 
 def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: object) -> None:
@@ -88,15 +91,44 @@ class FastKernel:
             self._program, self._compiled, self._launches = program, {}, {}
             self._on_cpu = impl.current_cfg().arch in (ti.x64, ti.arm64)
         used = self._used(args) if self._has_bundles else args
+        arrays = [used[index] for index, _ in self._arrays]
+        key = (*[used[index] for index in self._templates], *map(id, arrays))
+        launch = self._launches.get(key)
+        if launch is None:
+            compiled = self._compiled.get(self._key(used))
+            if compiled is None:
+                return self._first_call(program, args)
+            launch = self._launches[key] = self._kept(program, key, compiled, arrays, len(used))
         if self._on_cpu:
-            return self._call_on_cpu(program, args, used)
-        compiled = self._compiled.get(self._key(used))
-        if compiled is None:
-            return self._first_call(program, args)
-        context = compiled[0].make_launch_context()
-        for index, place in self._arrays:
-            context.set_arg_ndarray(place, used[index].arr)
-        return self._launch(program, compiled[1], context, used, [None] * len(used))
+            return self._launch(program, launch.compiled, launch.context, used, launch.numbers)
+        context = launch.make_context()  # it does not outlive the launch
+        for place, handle in launch.handles:
+            context.set_arg_ndarray(place, handle)
+        return self._launch(program, launch.compiled, context, used, [None] * len(used))
+
+    def _kept(
+        self, program: Any, key: tuple[Any, ...], compiled: tuple[Any, Any], arrays: Sequence[Any], used: int
+    ) -> _Launch:
+        """What is worth keeping of a launch.
+
+        On a CPU arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in
+        every launch.
+        """
+        kernel, executable = compiled
+        context, handles = None, []
+        if self._on_cpu:
+            context = kernel.make_launch_context()
+            for (_, place), array in zip(self._arrays, arrays, strict=True):
+                size = array.arr.nelement() * array.arr.element_size()
+                address = program.get_ndarray_data_ptr_as_int(array.arr)
+                context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
+        else:
+            handles = [(place, array.arr) for (_, place), array in zip(self._arrays, arrays, strict=True)]
+        if len(self._launches) >= MOST_LAUNCHES:
+            self._launches.clear()
+        forget = functools.partial(_forget, self._launches, key)
+        references = tuple(weakref.ref(array, forget) for array in arrays)
+        return _Launch(executable, kernel.make_launch_context, context, [None] * used, handles, references)
 
     def _used(self, args: tuple[Any, ...]) -> list[Any]:
         """Arguments that the kernel reads, fields of bundles among them. Raises TypeError where a bundle is another."""
@@ -109,32 +141,6 @@ class FastKernel:
             elif fields is not None:
                 used += fields(value)
         return used
-
-    def _call_on_cpu(self, program: Any, args: tuple[Any, ...], used: Sequence[Any]) -> Any:
-        """Launch with the context of an earlier call with these arrays.
-
-        Arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in every
-        launch. On a GPU the arguments do not outlive the launch.
-        """
-        arrays = [used[index] for index, _ in self._arrays]
-        key = (*[used[index] for index in self._templates], *map(id, arrays))
-        launch = self._launches.get(key)
-        if launch is None:
-            compiled = self._compiled.get(self._key(used))
-            if compiled is None:
-                return self._first_call(program, args)
-            context = compiled[0].make_launch_context()
-            for (_, place), array in zip(self._arrays, arrays, strict=True):
-                size = array.arr.nelement() * array.arr.element_size()
-                address = program.get_ndarray_data_ptr_as_int(array.arr)
-                context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
-            if len(self._launches) >= MOST_LAUNCHES:
-                self._launches.clear()
-            forget = functools.partial(_forget, self._launches, key)
-            references = tuple(weakref.ref(array, forget) for array in arrays)
-            launch = _Launch(compiled[1], context, references, [None] * len(used))
-            self._launches[key] = launch
-        return self._launch(program, launch.compiled, launch.context, used, launch.numbers)
 
     def _key(self, used: Sequence[Any]) -> tuple[Any, ...]:
         """What a kernel is compiled for: compile-time values, and the types of arrays."""

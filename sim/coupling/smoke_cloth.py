@@ -9,6 +9,7 @@ import taichi as ti
 from sim.cloth.air import WIND, Triangles
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import bundle, func
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.solver import Coupling
 from sim.smoke.arrays import Faces, new_floats
@@ -113,7 +114,7 @@ class SmokeClothCoupling(Coupling):
         state, air = self._cloth.state, self._cloth.air
         _find_triangles(self._box, self._hanging, state.position, air.wind)
         _ask_air(self._box, self._hanging, self._smoke.state.velocity, state.velocity, air.share, self._fastest)
-        fastest, found = (float(value) for value in self._fastest.to_numpy())
+        fastest, found = (float(value) for value in copied(self._fastest))
         self._fastest_past, self._reaches_cloth = fastest, found > 0.0
 
     def resume(self) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Integers, LongIntegers
 from sim.core.bundles import bundle
 from sim.core.domain import DomainParameters
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.solver import Coupling
 from sim.fluid.particles import Particles
@@ -100,7 +101,7 @@ class SmokeFluidCoupling(Coupling):
         """Largest step [s] in which no particle gets farther than a cell in the box, as far as is foreseen."""
         particles = self._fluid.particles.arrays
         _find_shortest_time(self._reach, self._gravity, particles, self._shortest_time)
-        time_s = float(self._shortest_time[0])
+        time_s = float(copied(self._shortest_time)[0])
         return time_s if time_s < NEVER else math.inf
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)

@@ -8,6 +8,7 @@ import taichi as ti
 
 from sim.core.arrays import Matrices, Vectors
 from sim.core.bundles import bundle
+from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.motion.paths import ArcLength, Path
 from sim.core.solver import Coupling
@@ -98,7 +99,7 @@ class SmokeRigidCoupling(Coupling):
             (self._bodies.velocity, bodies.velocity),
             (self._bodies.spin, bodies.angular_velocity),
         ):
-            array.from_numpy(values.astype(np.float32))
+            put(array, values)
         for number, geometry in enumerate(self._rigid.solids):
             half, middle = 0.5 * np.ptp(geometry.bounds, axis=0), geometry.bounds.mean(axis=0)
             centre, reach = bodies.position[number] + turned[number] @ middle, np.abs(turned[number]) @ half

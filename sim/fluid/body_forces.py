@@ -7,19 +7,22 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers, Vectors, on_device
-from sim.core.bundles import bundle
+from sim.core.bundles import bundle, func
 from sim.core.cells import CellGrid, Grid, SortedPoints, cell_of_point, row_of_cell
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.neighbors import GROWTH, ROUNDING_MARGIN
 from sim.core.parameters import Vector3
-from sim.fluid.body_response import BodyResponse, SolveError, weigh_errors
-from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples
+from sim.core.scan import scan_in_parallel, scan_scratch_length
+from sim.fluid.body_response import BodyResponse, accelerate, push
+from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples, Sheets
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
 from sim.fluid.particles import Fluid
-from sim.fluid.sheets import SheetForces
+from sim.fluid.sheets import SheetForces, SheetReaction, answer_of_sheets, react_of_sheets
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, Viscosity, viscous_factor
 
 CHUNK = 64  # samples of a body that one node of the sum takes together
+KEPT = 8  # forces on the bodies that wait on the device until the host asks for all of them
 
 
 @bundle
@@ -44,6 +47,15 @@ class Chunks(NamedTuple):
     wrench: Floats  # force [N] and torque [N m] of each chunk, (chunks * 6,)
 
 
+@bundle
+class Summed(NamedTuple):
+    """Forces on the samples, and their sums over the bodies."""
+
+    force: Vectors  # on each moving sample [N], (moving,)
+    wrench: Floats  # force [N] and torque [N m] on each body, (bodies * 6,)
+    chunks: Chunks
+
+
 class BodyForces:
     """Forces and torques of the fluid on each moving body, and their impulses in a step.
 
@@ -56,6 +68,7 @@ class BodyForces:
 
     Attributes:
         near: particles near each moving sample.
+        are_alone: whether no particle is near any moving sample, so that no forces act; until the next search.
         response: answer of the bodies' samples to forces within the step; None where they wait for its end.
         sheets: forces on the samples of sheets; None where there are none.
     """
@@ -70,7 +83,7 @@ class BodyForces:
         ]
         chunk_of_body = np.concatenate([[0], np.cumsum([len(each) for each in chunks])]).astype(np.int32)
         count = int(chunk_of_body[-1])
-        self._chunks = Chunks(
+        samples_of = Chunks(
             count=count,
             start=on_device(np.concatenate([*chunks, [boundary.body_sample_count]])),
             of_body=on_device(chunk_of_body),
@@ -83,8 +96,13 @@ class BodyForces:
             count=ti.ndarray(ti.i32, samples),
             particles=ti.ndarray(ti.i32, 1),
         )
-        self._force = ti.Vector.ndarray(3, ti.f32, samples)
-        self._wrench = ti.ndarray(ti.f32, bodies * WRENCH_WIDTH)
+        self._scratch = ti.ndarray(ti.i32, scan_scratch_length(samples))
+        self.are_alone = False
+        self.summed = Summed(
+            ti.Vector.ndarray(3, ti.f32, samples), ti.ndarray(ti.f32, bodies * WRENCH_WIDTH), samples_of
+        )
+        self._kept = ti.ndarray(ti.f32, KEPT * bodies * WRENCH_WIDTH)
+        self._kept_dt: list[float] = []
         self._impulse: NDArray[np.float64] = np.zeros((boundary.body_count, WRENCH_WIDTH))
         self.response: BodyResponse | None = None
         self.sheets: SheetForces | None = None
@@ -101,14 +119,13 @@ class BodyForces:
             return
         samples, grid, radius_squared = self._boundary.samples, self._grid.on_device, self._search_radius**2
         # The margin is for distances that are rounded differently when they are listed.
-        bound = radius_squared * (1.0 + ROUNDING_MARGIN)
-        find_particles_near_samples(samples, self.near, points, grid, bound, False)
-        starts = np.zeros(self._boundary.moving_count + 1, dtype=np.int32)
-        np.cumsum(self.near.count.to_numpy(), out=starts[1:])
-        self.near.start.from_numpy(starts)
-        if starts[-1] > self.near.particles.shape[0]:
-            self.near = self.near._replace(particles=ti.ndarray(ti.i32, int(starts[-1] * GROWTH)))
-        find_particles_near_samples(samples, self.near, points, grid, radius_squared, True)
+        bounds = radius_squared * (1.0 + ROUNDING_MARGIN), radius_squared
+        while True:
+            entries = find_particles_near_samples(samples, self.near, self._scratch, points, grid, *bounds)
+            if entries <= self.near.particles.shape[0]:
+                break
+            self.near = self.near._replace(particles=ti.ndarray(ti.i32, int(entries * GROWTH)))
+        self.are_alone = entries == 0
 
     def let_bodies_respond(self, gravity: Vector3, discretization: Discretization) -> None:
         """From now on the bodies' samples, if there are any, answer to forces within the step."""
@@ -117,82 +134,132 @@ class BodyForces:
 
     def gather(self, exerted: Exerted, dt: float) -> None:
         """Add the impulses of a step of dt [s], from forces that the fluid has just felt."""
-        if self._boundary.moving_count == 0:
+        if self._boundary.moving_count == 0 or self.are_alone:
             return
-        self._gather(exerted)
-        if self._boundary.body_count:
-            self._impulse += dt * self._host_wrenches()
-        if self.response is not None:
-            self.response.push_samples(self._wrench, dt)
-        if self.sheets is not None:
-            self.sheets.count_forces(self._force, dt)
+        if len(self._kept_dt) == KEPT:
+            self._count_impulses()
+        response, sheets, boundary = self.response, self.sheets, self._boundary
+        react_to_forces(
+            self.near,
+            exerted,
+            boundary.bodies,
+            self.summed.wrench if response is None else response.mobility,
+            boundary.sheets,
+            self._no_reaction if sheets is None else sheets.reaction,
+            self.summed,
+            self._kept,
+            len(self._kept_dt) * boundary.body_count * WRENCH_WIDTH,
+            dt,
+            response is not None,
+            sheets is not None,
+            sheets is not None and sheets.answers,
+        )
+        self._kept_dt.append(dt)
 
     def respond(self, exerted: Exerted) -> ti.Ndarray:
         """Acceleration of each boundary sample by forces that are only tried [m/s²]; their impulses do not count."""
         assert self.response is not None
-        self._gather(exerted)
-        acceleration = self.response.accelerate_samples(self._wrench)
-        if self.sheets is not None and self.sheets.answers:
-            self.sheets.accelerate(self._force, acceleration)
-        return acceleration
+        if self.are_alone:
+            return self.response.no_acceleration
+        response, boundary = self.response, self._boundary
+        sheets = self.sheets if self.sheets is not None and self.sheets.answers else None
+        answer_forces(
+            self.near,
+            exerted,
+            boundary.bodies,
+            response.mobility,
+            boundary.sheets,
+            self.summed.wrench if sheets is None else sheets.reaction.mass,
+            self.summed,
+            response.acceleration,
+            sheets is not None,
+        )
+        return response.acceleration
 
     def measure(self, exerted: Exerted) -> NDArray[np.float64]:
         """Forces [N] and torques [N m] on each body that are only tried, (bodies, 6)."""
-        self._gather(exerted)
-        return self._host_wrenches()
-
-    def worst_mean_near_bodies(self, fluid: Fluid, error: SolveError) -> float:
-        """Mean error of a pressure solve among the particles near a body, weighted by its kernel: the largest."""
-        weigh_errors(self.near, fluid, error, self._force)
-        self._sum_over_bodies()
-        total, weight = self._host_wrenches()[:, :2].T
-        return float(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.0).max(initial=0.0))
+        if self.are_alone:
+            return np.zeros((self._boundary.body_count, WRENCH_WIDTH))
+        measure_forces(self.near, exerted, self._boundary.bodies, self.summed)
+        return self._rows(copied(self.summed.wrench))
 
     def take_impulses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Impulses on the bodies since the last call [N s], and angular ones [N m s], (bodies, 3) each."""
+        self._count_impulses()
         taken, self._impulse = self._impulse, np.zeros_like(self._impulse)
         return taken[:, :3], taken[:, 3:]
 
-    def _gather(self, exerted: Exerted) -> None:
-        gather_sample_forces(self.near, exerted, self._force)
-        self._sum_over_bodies()
+    def _count_impulses(self) -> None:
+        """Add the impulses of all forces that wait on the device."""
+        if self._kept_dt and self._boundary.body_count:
+            kept = copied(self._kept).reshape(KEPT, -1)
+            for dt, wrenches in zip(self._kept_dt, kept, strict=False):
+                self._impulse += dt * self._rows(wrenches)
+        self._kept_dt = []
 
-    def _host_wrenches(self) -> NDArray[np.float64]:
+    def _rows(self, wrenches: NDArray[np.generic]) -> NDArray[np.float64]:
         entries = self._boundary.body_count * WRENCH_WIDTH
-        return self._wrench.to_numpy()[:entries].astype(np.float64).reshape(-1, WRENCH_WIDTH)
+        return wrenches[:entries].astype(np.float64).reshape(-1, WRENCH_WIDTH)
 
-    def _sum_over_bodies(self) -> None:
-        sum_sample_forces(self._boundary.samples, self._boundary.bodies, self._force, self._chunks, self._wrench)
+    @property
+    def _no_reaction(self) -> SheetReaction:
+        """Stands for that of sheets where there are none; kernels do not read it."""
+        force = self.summed.force
+        return SheetReaction(self.summed.wrench, force, force, force)
+
+
+@func
+def near_one_sample(
+    near: NearParticles,
+    b: ti.i32,
+    x_b: ti.math.vec3,
+    points: SortedPoints,
+    grid: Grid,
+    radius_squared: ti.f32,
+    is_listing: ti.template(),
+) -> ti.i32:
+    """Number of particles near a moving sample, and, where they are listed and there is room, these in their order."""
+    cell = cell_of_point(x_b, grid)
+    found = 0
+    for dz in range(-grid.reach, grid.reach + 1):
+        for dy in range(-grid.reach, grid.reach + 1):
+            row = row_of_cell(cell, dy, dz, grid)
+            for i in range(points.cell_start[row - grid.reach], points.cell_start[row + grid.reach + 1]):
+                x_i = ti.math.vec3(points.x[i], points.y[i], points.z[i])
+                if (x_b - x_i).norm_sqr() < radius_squared:
+                    if ti.static(is_listing):
+                        place = near.start[b] + found
+                        if place < near.particles.shape[0]:
+                            near.particles[place] = i
+                    found += 1
+    return found
 
 
 @kernel
 def find_particles_near_samples(
     samples: Samples,
     near: NearParticles,
+    scratch: Integers,
     points: SortedPoints,
     grid: Grid,
+    bound: ti.f32,
     radius_squared: ti.f32,
-    is_listing: ti.template(),
-):
-    """Number of particles near each moving sample, and, where they are listed, these in their order."""
+) -> ti.i32:
+    """List the particles near each moving sample; returns for how many there has to be room, else the list is cut.
+
+    They are counted within the bound, on a squared radius, a little more than that within which they are listed.
+    """
+    for b in range(near.sample_count):
+        near.count[b] = near_one_sample(near, b, samples.position[near.first + b], points, grid, bound, False)
+    entries = scan_in_parallel(near.count, near.sample_count, scratch, near.start)
     for b in range(near.sample_count):
         x_b = samples.position[near.first + b]
-        cell = cell_of_point(x_b, grid)
-        found = 0
-        for dz in range(-grid.reach, grid.reach + 1):
-            for dy in range(-grid.reach, grid.reach + 1):
-                row = row_of_cell(cell, dy, dz, grid)
-                for i in range(points.cell_start[row - grid.reach], points.cell_start[row + grid.reach + 1]):
-                    x_i = ti.math.vec3(points.x[i], points.y[i], points.z[i])
-                    if (x_b - x_i).norm_sqr() < radius_squared:
-                        if ti.static(is_listing):
-                            near.particles[near.start[b] + found] = i
-                        found += 1
-        near.count[b] = found
+        near.count[b] = near_one_sample(near, b, x_b, points, grid, radius_squared, True)
+    return entries
 
 
-@kernel
-def gather_sample_forces(near: NearParticles, exerted: Exerted, force: Vectors):
+@func
+def gather_forces(near: NearParticles, exerted: Exerted, force: Vectors):
     """The opposite of what each moving sample does to its particles [N]; terms as in the fluid's own sum."""
     fluid, viscosity = ti.static((exerted.fluid, exerted.viscosity))
     particles, samples = ti.static((fluid.particles, fluid.samples))
@@ -218,9 +285,10 @@ def gather_sample_forces(near: NearParticles, exerted: Exerted, force: Vectors):
         force[b] = exerted.volume_gradient_factor * samples.volume[near.first + b] * total
 
 
-@kernel
-def sum_sample_forces(samples: Samples, bodies: Bodies, force: Vectors, chunks: Chunks, wrench: Floats):
+@func
+def sum_over_bodies(samples: Samples, bodies: Bodies, summed: Summed):
     """Force and torque about the centre of mass of each body, chunk by chunk, always in the same order."""
+    chunks, force = ti.static((summed.chunks, summed.force))
     for chunk in range(chunks.count):
         s = bodies.body[chunks.start[chunk]] * STATE_WIDTH
         centre = ti.math.vec3(bodies.states[s], bodies.states[s + 1], bodies.states[s + 2])
@@ -237,4 +305,58 @@ def sum_sample_forces(samples: Samples, bodies: Bodies, force: Vectors, chunks: 
         total = 0.0
         for chunk in range(chunks.of_body[of_body], chunks.of_body[of_body + 1]):
             total += chunks.wrench[chunk * WRENCH_WIDTH + entry % WRENCH_WIDTH]
-        wrench[entry] = total
+        summed.wrench[entry] = total
+
+
+@kernel
+def measure_forces(near: NearParticles, exerted: Exerted, bodies: Bodies, summed: Summed):
+    """Forces on the samples and their sums over the bodies."""
+    gather_forces(near, exerted, summed.force)
+    sum_over_bodies(exerted.fluid.samples, bodies, summed)
+
+
+@kernel
+def answer_forces(
+    near: NearParticles,
+    exerted: Exerted,
+    bodies: Bodies,
+    mobility: Floats,
+    sheets: Sheets,
+    sheet_mass: Floats,
+    summed: Summed,
+    acceleration: Vectors,
+    with_sheets: ti.template(),
+):
+    """Accelerations of all moving samples by forces that are tried."""
+    gather_forces(near, exerted, summed.force)
+    sum_over_bodies(exerted.fluid.samples, bodies, summed)
+    accelerate(exerted.fluid.samples, bodies, summed.wrench, mobility, acceleration)
+    if ti.static(with_sheets):
+        answer_of_sheets(summed.force, sheets, sheet_mass, acceleration)
+
+
+@kernel
+def react_to_forces(
+    near: NearParticles,
+    exerted: Exerted,
+    bodies: Bodies,
+    mobility: Floats,
+    sheets: Sheets,
+    reaction: SheetReaction,
+    summed: Summed,
+    kept: Floats,
+    first: ti.i32,
+    dt: ti.f32,
+    bodies_answer: ti.template(),
+    with_sheets: ti.template(),
+    sheets_answer: ti.template(),
+):
+    """Forces that count, for dt [s]: those on bodies are kept from `first` on, and samples that answer move on."""
+    gather_forces(near, exerted, summed.force)
+    sum_over_bodies(exerted.fluid.samples, bodies, summed)
+    for entry in range(bodies.count * WRENCH_WIDTH):
+        kept[first + entry] = summed.wrench[entry]
+    if ti.static(bodies_answer):
+        push(exerted.fluid.samples, bodies, summed.wrench, mobility, ti.math.vec3(0.0), dt)
+    if ti.static(with_sheets):
+        react_of_sheets(summed.force, sheets, dt, reaction, exerted.fluid.samples, sheets_answer)

@@ -7,6 +7,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Vectors
+from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.fluid.body_response import BodyResponse
 from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, Samples
@@ -124,7 +125,7 @@ class BodyFriction:
         """Fill `changes` with J_b u for the changes u of the bodies, (bodies, 6)."""
         if self._boundary.body_count == 0:
             return
-        self._twists.from_numpy(np.ascontiguousarray(twists, dtype=np.float32).ravel())
+        put(self._twists, twists.ravel())
         spread_twists(self._boundary.samples, self._boundary.bodies, self._twists, self.changes)
 
     def _multiplied(self, twists: NDArray[np.float64], vector: ti.Ndarray) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
+from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
@@ -57,7 +58,8 @@ class BodyResponse:
         is_needed: whether any body is free to answer.
         inverse_masses: M^-1 of each body, mass [1/kg] and inertia tensor in world axes [1/(kg m²)], (bodies, 6, 6), on
             the host; 0 for bodies on given paths.
-        no_acceleration: of all boundary samples where none is [m/s²].
+        acceleration, no_acceleration: of all boundary samples [m/s²], the latter 0 for all; the former is 0 for the
+            fixed ones.
     """
 
     def __init__(self, boundary: Boundary, gravity: Vector3, discretization: Discretization) -> None:
@@ -71,7 +73,7 @@ class BodyResponse:
             share=ti.ndarray(ti.i32, bodies),
         )
         self._no_wrench = on_device(np.zeros(bodies * WRENCH_WIDTH))
-        self._acceleration, self.no_acceleration = (on_device(np.zeros((boundary.count, 3))) for _ in range(2))
+        self.acceleration, self.no_acceleration = (on_device(np.zeros((boundary.count, 3))) for _ in range(2))
         self.is_needed = False
         self.inverse_masses: NDArray[np.float64] = np.zeros((boundary.body_count, WRENCH_WIDTH, WRENCH_WIDTH))
 
@@ -83,28 +85,23 @@ class BodyResponse:
         self.inverse_masses[:, 3:, 3:] = inverse_inertia
         if not len(rows):
             return
-        self._mobility.inverse_mass.from_numpy(np.ascontiguousarray(rows, dtype=np.float32).ravel())
+        put(self._mobility.inverse_mass, rows.ravel())
         turning = np.trace(inverse_inertia, axis1=1, axis2=2) * self._boundary.reach**2
         cap = LARGEST_PUSH / self._discretization.spacing * np.sqrt(inverse_mass + turning)
         particles = PARTICLES_PER_SAMPLE * (np.diff(self._boundary.body_start) + PARTICLES_PER_SAMPLE)
         scale = np.divide(LARGEST_SHARE, particles * cap, out=np.zeros_like(cap), where=cap > 0.0)
-        self._mobility.cap.from_numpy(cap.astype(np.float32))
-        self._mobility.share_scale.from_numpy(scale.astype(np.float32))
+        put(self._mobility.cap, cap)
+        put(self._mobility.share_scale, scale)
+
+    @property
+    def mobility(self) -> ti.Ndarray:
+        """Inverse mass [1/kg] and inertia tensor [1/(kg m²)], 10 numbers a body, on the device."""
+        return self._mobility.inverse_mass
 
     def fall(self, dt: float) -> None:
         """Let gravity act on the samples' velocities for dt [s]."""
-        self.push_samples(self._no_wrench, dt, gravity_share=1.0)
-
-    def push_samples(self, wrench: ti.Ndarray, dt: float, *, gravity_share: float = 0.0) -> None:
-        """Let forces and torques on the bodies, and a share of gravity, act on the samples' velocities for dt [s]."""
-        gravity = gravity_share * self._gravity
-        push_samples(self._boundary.samples, self._boundary.bodies, wrench, self._mobility.inverse_mass, gravity, dt)
-
-    def accelerate_samples(self, wrench: ti.Ndarray) -> ti.Ndarray:
-        """Accelerations of all boundary samples by forces and torques on the bodies [m/s²]; 0 for the fixed ones."""
-        boundary = self._boundary
-        accelerate_samples(boundary.samples, boundary.bodies, wrench, self._mobility.inverse_mass, self._acceleration)
-        return self._acceleration
+        samples, bodies = self._boundary.samples, self._boundary.bodies
+        push_samples(samples, bodies, self._no_wrench, self.mobility, self._gravity, dt)
 
     def add_to_diagonal(self, fluid: Fluid, relaxation: float, inverse_diagonal: ti.Ndarray) -> None:
         """Add the bodies' share in A to its diagonal, such that relaxation by the diagonal converges.
@@ -151,8 +148,8 @@ def times_inverse_inertia(m: ti.i32, mobility: Floats, vector: ti.math.vec3) -> 
     return product
 
 
-@kernel
-def push_samples(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Floats, gravity: ti.math.vec3, dt: ti.f32):
+@func
+def push(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Floats, gravity: ti.math.vec3, dt: ti.f32):
     """v_b += dt (g + F/m + (I^-1 M) x r_b) for free bodies."""
     for b in range(bodies.sample_count):
         a_b = acceleration_at(samples.position[bodies.first + b], bodies.body[b], bodies.states, wrench, mobility)
@@ -162,7 +159,13 @@ def push_samples(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Flo
 
 
 @kernel
-def accelerate_samples(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Floats, acceleration: Vectors):
+def push_samples(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Floats, gravity: ti.math.vec3, dt: ti.f32):
+    """As `push`."""
+    push(samples, bodies, wrench, mobility, gravity, dt)
+
+
+@func
+def accelerate(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Floats, acceleration: Vectors):
     """a_b = F/m + (I^-1 M) x r_b."""
     for b in range(bodies.sample_count):
         acceleration[bodies.first + b] = acceleration_at(
@@ -241,7 +244,7 @@ def add_bodies_to_diagonal(
         inverse_diagonal[i] = inverse / (1.0 + weight * bound * inverse)
 
 
-@kernel
+@func
 def weigh_errors(near: NearParticles, fluid: Fluid, error: SolveError, weighed: Vectors):
     """Errors of the particles near each sample as a pressure solve counts them, and their weights, V_b w_ib each."""
     for b in range(near.sample_count):

@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle
-from sim.core.cells import CellGrid, CellSort, SortedPoints
+from sim.core.cells import CellGrid, CellSort, Grid, SortArrays, SortedPoints, counting_sort
+from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.solver import Arrays
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.kernels import Discretization
 
-EVERYWHERE = (-1.0e30,) * 3, (1.0e30,) * 3  # corners of a box that holds every sample [m]
+FAR = 1.0e30  # coordinate that no sample reaches [m]
+EVERYWHERE = (-FAR,) * 3, (FAR,) * 3  # corners of a box that holds every sample [m]
 STATE_WIDTH = 18  # numbers of a body's state: centre of mass, rotation row by row, velocity, angular velocity
 NO_BODY = 2**31 - 1  # stands for the number of a body where there is none
 WRENCH_WIDTH = 6  # numbers of a force with its torque
@@ -205,20 +207,26 @@ class Boundary:
 
     def _place(self, states: NDArray[np.generic]) -> None:
         self._host_states = np.ascontiguousarray(states)
-        self.bodies.states.from_numpy(self._host_states)
+        put(self.bodies.states, self._host_states)
         place_samples(self._offset, self.bodies, self.samples)
 
     def sort_moving(self) -> SortedPoints | None:
         """Sort the moving samples by cell, where they are now, into `moving_index` too; None where there are none."""
         if self._moving_cells is None or self._moving_points is None:
             return None
-        self._reference_states = self.bodies.states.to_numpy()
-        count, first = self.moving_count, self.fixed_count
-        take_samples(self.samples.position, first, count, self._moving_position)
-        take_samples(self.samples.position, self.sheets.first, self.sheet_count, self._reference_sheets)
-        self._moving_cells.sort(self._moving_position, self._moving_ids, count, *EVERYWHERE)
-        order_samples(
-            self._moving_position, self._moving_cells.order, count, first, self._moving_points, self.moving_index
+        self._reference_states = self._host_states
+        sort_moving_samples(
+            self.samples,
+            self.fixed_count,
+            self.moving_count,
+            self.sheets,
+            self._moving_position,
+            self._reference_sheets,
+            self._moving_ids,
+            self._moving_cells.grid.on_device,
+            self._moving_cells.arrays,
+            self._moving_points,
+            self.moving_index,
         )
         return self._moving_points
 
@@ -249,20 +257,31 @@ def place_samples(offset: Vectors, bodies: Bodies, samples: Samples):
 
 
 @kernel
-def take_samples(position: Vectors, first: ti.i32, count: ti.i32, taken: Vectors):
-    """Copy of `count` samples from `first` on."""
-    for b in range(count):
-        taken[b] = position[first + b]
-
-
-@kernel
-def order_samples(
-    position: Vectors, order: Integers, count: ti.i32, first: ti.i32, points: SortedPoints, index: Integers
+def sort_moving_samples(
+    samples: Samples,
+    first: ti.i32,
+    count: ti.i32,
+    sheets: Sheets,
+    position: Vectors,
+    reference: Vectors,
+    ids: Integers,
+    grid: Grid,
+    arrays: SortArrays,
+    points: SortedPoints,
+    index: Integers,
 ):
-    """Coordinates of the moving samples as they are sorted, and the index of each among all samples."""
+    """Sort the moving samples, wherever they are, and note where those of sheets are.
+
+    Coordinates as they are sorted, and the index of each among all samples.
+    """
+    for b in range(count):
+        position[b] = samples.position[first + b]
+    for s in range(sheets.count):
+        reference[s] = samples.position[sheets.first + s]
+    counting_sort(position, ids, count, grid, ti.math.vec3(-FAR), ti.math.vec3(FAR), arrays)
     for k in range(count):
-        x_b = position[order[k]]
+        x_b = position[arrays.order[k]]
         points.x[k] = x_b[0]
         points.y[k] = x_b[1]
         points.z[k] = x_b[2]
-        index[k] = first + order[k]
+        index[k] = first + arrays.order[k]

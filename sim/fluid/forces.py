@@ -108,8 +108,9 @@ class Forces:
 
     def begin_sheets(self) -> None:
         """Find the fluid that touches sheets at the start of a step, before anything acts between them."""
-        if self._tank.body_forces.sheets is not None:
-            self._tank.body_forces.sheets.begin_step(self._tank.on_device, self._tank.body_forces.near)
+        body_forces = self._tank.body_forces
+        if body_forces.sheets is not None:
+            body_forces.sheets.begin_step(self._tank.on_device, body_forces.near, are_alone=body_forces.are_alone)
 
     def compute(self, dt: float, elastic: Elastic | None = None) -> None:
         """Fill `acceleration` with all forces known before a step of dt [s], and count their reaction."""
@@ -149,10 +150,11 @@ class Forces:
         if pressure_term is not None or self._viscosity.with_wall_friction:
             body_forces.gather(self.exerted(pressure_term, with_friction=True), dt)
         # After the gathering: the particles felt friction against samples that had not begun to fall or recoil.
-        if body_forces.response is not None:
+        if body_forces.response is not None and not body_forces.are_alone:
             body_forces.response.fall(dt)
         if sheets is not None:
             sheets.recoil(dt, DENSITY)
+        if sheets is not None and not body_forces.are_alone:
             sheets.add_missing_weight(self._tank.on_device, body_forces.near, dt)
 
     def add_implicit_viscosity(self, dt: float) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle
 from sim.core.cells import CellGrid, CellSort, SortedPoints
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.neighbors import NeighborList, Neighbors, list_stride
 from sim.core.parameters import Vector3
@@ -139,7 +140,7 @@ class ParticleSet:
 
     def host(self, array: ti.Ndarray) -> NDArray[np.generic]:
         """Copy of an array (capacity,) on the host, without the room for particles that are not there."""
-        return array.to_numpy()[: self.count]
+        return copied(array)[: self.count]
 
     def order_by_id(self) -> NDArray[np.int64]:
         """Indices of the particles by ascending id, (n,)."""

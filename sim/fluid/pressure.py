@@ -19,7 +19,9 @@ from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced_tree
-from sim.fluid.body_response import SolveError, error_left
+from sim.fluid.body_forces import Summed, sum_over_bodies
+from sim.fluid.body_response import SolveError, error_left, weigh_errors
+from sim.fluid.boundary import WRENCH_WIDTH, Bodies, NearParticles
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.kernels import distance, evaluate_slope, inverse_distance, lattice_offsets, spline, spline_slope
 from sim.fluid.particles import Fluid
@@ -100,13 +102,13 @@ class IncompressibleFluid(SPHFluid):
         fluid, inverse_diagonal = self.tank.on_device, self.system.inverse_diagonal
         compute_density_and_alpha(fluid, self._least_diagonal, inverse_diagonal)
         response = self.body_forces.response
-        if response is not None and response.is_needed:
+        if response is not None and response.is_needed and not self.body_forces.are_alone:
             response.add_to_diagonal(fluid, self.relaxation, inverse_diagonal)
 
     def begin_sheets(self) -> None:
         """Find the fluid that touches sheets, and add their share in A to its diagonal."""
         self.forces.begin_sheets()
-        if (sheets := self.body_forces.sheets) is not None:
+        if (sheets := self.body_forces.sheets) is not None and not self.body_forces.are_alone:
             fluid, inverse_diagonal = self.tank.on_device, self.system.inverse_diagonal
             sheets.add_to_diagonal(fluid, self.body_forces.near, self.relaxation, inverse_diagonal)
 
@@ -202,13 +204,17 @@ class IncompressibleFluid(SPHFluid):
         count = self.particles.count
         left = self.system.remaining if remaining is None else remaining
         error_of_each = SolveError(left, pressure, self.system.inverse_diagonal, dt**2)
-        results = sum_errors(error_of_each, count, self._reduction.over(count))
-        error = float(self._reduction.unpack(results)[0]) / max(count, 1)
-        response = self.body_forces.response
-        if response is not None and response.is_needed:
+        share, forces = self._reduction.over(count), self.body_forces
+        if forces.response is None or not forces.response.is_needed or forces.are_alone:
+            total, near_body, weight = sum_errors(error_of_each, count, share)[0], 0.0, 0.0
+        else:
+            fluid, bodies = self.tank.on_device, self.boundary.bodies
+            found = sum_errors_near_bodies(error_of_each, count, share, forces.near, fluid, bodies, forces.summed)
+            total, near_body, weight = found[:3]
+        error = total / max(count, 1)
+        if weight > 0.0:
             # A light body answers to the few particles around it, whose error the mean over all of them would hide.
-            near_bodies = self.body_forces.worst_mean_near_bodies(self.tank.on_device, error_of_each)
-            error = max(error, CARE_NEAR_BODIES * near_bodies)
+            error = max(error, CARE_NEAR_BODIES * near_body / weight)
         return error if error < LARGEST_ERROR else math.inf
 
     def adapt_time_step(self) -> float:
@@ -445,9 +451,9 @@ def add_scaled(vector: Vectors, other: Vectors, factor: ti.f32, count: ti.i32):
         vector[i] += factor * other[i]
 
 
-@kernel
-def sum_errors(error: SolveError, count: ti.i32, share: Share) -> Results:
-    """Sum of the errors of all particles that can have a pressure."""
+@func
+def error_of_lanes(error: SolveError, count: ti.i32, share: Share):
+    """The lanes' sums of the errors of all particles that can have a pressure."""
     for lane in range(share.tree.lanes):
         total = 0.0
         for k in range(share.items):
@@ -455,4 +461,35 @@ def sum_errors(error: SolveError, count: ti.i32, share: Share) -> Results:
             if i < count and error.inverse_diagonal[i] > 0.0:
                 total += error_left(error, i)
         share.tree.partial[lane] = total
+
+
+@kernel
+def sum_errors(error: SolveError, count: ti.i32, share: Share) -> Results:
+    """Sum of the errors of all particles that can have a pressure."""
+    error_of_lanes(error, count, share)
     return reduced_tree(share.tree)
+
+
+@kernel
+def sum_errors_near_bodies(
+    error: SolveError,
+    count: ti.i32,
+    share: Share,
+    near: NearParticles,
+    fluid: Fluid,
+    bodies: Bodies,
+    summed: Summed,
+) -> Results:
+    """As `sum_errors`; then the sum of the weighed errors near the body that has the largest mean, and of weights."""
+    error_of_lanes(error, count, share)
+    weigh_errors(near, fluid, error, summed.force)
+    sum_over_bodies(fluid.samples, bodies, summed)
+    results = reduced_tree(share.tree)
+    worst, its_weight = 0.0, 0.0
+    ti.loop_config(serialize=True)
+    for body in range(bodies.count):
+        of_body, weight = summed.wrench[body * WRENCH_WIDTH], summed.wrench[body * WRENCH_WIDTH + 1]
+        if weight > 0.0 and of_body * its_weight >= worst * weight:
+            worst, its_weight = of_body, weight
+    results[1], results[2] = worst, its_weight
+    return results

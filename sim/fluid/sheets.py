@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from sim.core.arrays import Floats, Vectors, on_device
-from sim.core.bundles import bundle
+from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.solver import Arrays
@@ -32,8 +32,19 @@ from sim.fluid.particles import Fluid
 from sim.fluid.stepping import Box
 
 DIVERGENCE, DENSITY = 0, 1  # solves of a step whose forces last apart: of divergence, of density with all other forces
+STEPS_REMEMBERED = 2  # after which arrays that took turns hold forces of the time alone
 FULL_CONTACT = 0.5  # of the density that samples give to fluid at rest beside them: with it a particle touches in full
 AMID_SAMPLES = 2.5  # density in the middle of a sheet by its samples alone: so far above 1 that nothing gets through
+
+
+@bundle
+class SheetReaction(NamedTuple):
+    """What forces do to the samples of sheets, (m,) each."""
+
+    mass: Floats  # with which they answer [kg]
+    push: Vectors  # sum of the changes of their velocity since they were placed [m/s]
+    expected: Vectors  # sum of the forces of a solve, which the next step expects [N]
+    impulse: Vectors  # of all forces in the step [N s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,36 +167,41 @@ class SheetForces:
         self.impulse, self.push, *forces = (on_device(np.zeros((count, 3))) for _ in range(6))
         self._expected, self._found = forces[:2], forces[2:]
         self.solve = DIVERGENCE
+        self._steps_alone = 0
         self._contacts = Contacts(ti.Vector.ndarray(3, ti.f32, capacity), ti.ndarray(ti.f32, capacity), 0)
 
-    def begin_step(self, fluid: Fluid, near: NearParticles) -> None:
-        """Forget the impulses of the last step, and find the masses with which samples answer in this one."""
+    def begin_step(self, fluid: Fluid, near: NearParticles, *, are_alone: bool) -> None:
+        """Forget the impulses of the last step, and find the masses with which samples answer in this one.
+
+        `are_alone` says that no particle is near any sample.
+        """
         sheets = self._boundary.sheets
         self._expected, self._found = self._found, self._expected
-        for vectors in (self.impulse, self.push, *self._found):
-            clear_vectors(vectors, sheets.count)
+        self._steps_alone = self._steps_alone + 1 if are_alone else 0
+        if self._are_at_rest:
+            self._contacts = self._contacts._replace(count=0)
+            return
         self._contacts = self._contacts._replace(count=fluid.particles.count)
-        weigh_contacts(fluid, sheets, self._full_field, self._contacts)
-        gather_contact_mass(fluid, near, sheets, self._contacts.mass, self.mass)
-        if self.answers:
-            take_larger(self.mass, self._own_mass, sheets.count, self._answering_mass)
+        forgotten = self.impulse, self.push, *self._found
+        masses = self.mass, self._own_mass, self._answering_mass
+        begin_sheet_step(fluid, near, sheets, self._full_field, self._contacts, *masses, *forgotten, self.answers)
+
+    @property
+    def _are_at_rest(self) -> bool:
+        """Whether nothing touches now, nor did in the steps whose forces count: all is 0, and stays so."""
+        return self._steps_alone > STEPS_REMEMBERED
 
     def recoil(self, dt: float, solve: int) -> None:
         """Push the samples for dt [s] by the opposite of what acted on them in this solve of the last step."""
         self.solve = solve
-        if self.answers:
-            self._push(self._expected[solve], 0, -dt)
+        if self.answers and not self._are_at_rest:
+            sheets, samples = self._boundary.sheets._replace(skipped=0), self._boundary.samples
+            push_sheet_samples(self._expected[solve], sheets, -dt, self._answering_mass, samples, self.push)
 
-    def count_forces(self, force: ti.Ndarray, dt: float) -> None:
-        """Count forces on the moving samples [N] for a step of dt [s]; those of sheets answer to them."""
-        sheets = self._boundary.sheets
-        count_impulses(force, sheets, dt, self._found[self.solve], self.impulse)
-        if self.answers:
-            self._push(force, sheets.skipped, dt)
-
-    def accelerate(self, force: ti.Ndarray, acceleration: ti.Ndarray) -> None:
-        """Fill in the accelerations of the sheets' samples by forces on the moving samples that are only tried."""
-        accelerate_sheet_samples(force, self._boundary.sheets, self._answering_mass, acceleration)
+    @property
+    def reaction(self) -> SheetReaction:
+        """What forces of the present solve do."""
+        return SheetReaction(self._answering_mass, self.push, self._found[self.solve], self.impulse)
 
     def add_to_diagonal(
         self, fluid: Fluid, near: NearParticles, relaxation: float, inverse_diagonal: ti.Ndarray
@@ -200,8 +216,8 @@ class SheetForces:
         sheets, d = self._boundary.sheets, self._discretization
         gradient_factor = d.sigma * d.inverse_support
         weight = relaxation * d.particle_volume
-        sum_sheet_gradients(fluid, near, sheets, gradient_factor, self._answering_mass, self._answer)
-        add_sheets_to_diagonal(fluid, sheets, self._answer, gradient_factor, weight, inverse_diagonal)
+        mass, answer = self._answering_mass, self._answer
+        add_sheets_to_diagonal(fluid, near, sheets, mass, answer, gradient_factor, weight, inverse_diagonal)
 
     def add_missing_weight(self, fluid: Fluid, near: NearParticles, dt: float) -> None:
         """Count the weight of the water that samples keep away and that a thin sheet would not, for a step of dt [s].
@@ -218,7 +234,8 @@ class SheetForces:
 
         Positions follow as if it had been so during the step, up to the walls of the box.
         """
-        take_sheet_motion(fluid, self._contacts, self._boundary.sheets, change, dt, box)
+        if self._contacts.count:
+            take_sheet_motion(fluid, self._contacts, self._boundary.sheets, change, dt, box)
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:
         """The forces of the last step, which the next one expects."""
@@ -228,15 +245,33 @@ class SheetForces:
         """Continue from a checkpoint."""
         for solve, force in enumerate(self._found):
             force.from_numpy(np.ascontiguousarray(arrays[f"sheet_force_{solve}"]))
-
-    def _push(self, force: ti.Ndarray, skipped: int, factor: float) -> None:
-        sheets, samples = self._boundary.sheets._replace(skipped=skipped), self._boundary.samples
-        push_sheet_samples(force, sheets, factor, self._answering_mass, samples, self.push)
+        self._steps_alone = 0
 
 
 @kernel
-def weigh_contacts(fluid: Fluid, sheets: Sheets, full_field: ti.f32, contacts: Contacts):
-    """Mass of each particle that touches sheets, m_i min(1, s_i/s_full), over s_i = sum_b V_b W_ib [kg], and where."""
+def begin_sheet_step(
+    fluid: Fluid,
+    near: NearParticles,
+    sheets: Sheets,
+    full_field: ti.f32,
+    contacts: Contacts,
+    mass: Floats,
+    own_mass: Floats,
+    answering_mass: Floats,
+    impulse: Vectors,
+    push: Vectors,
+    divergence_force: Vectors,
+    density_force: Vectors,
+    answers: ti.template(),
+):
+    """Clear what counts anew in a step, and share out the fluid that touches sheets.
+
+    Mass of each particle that touches sheets, m_i min(1, s_i/s_full), over s_i = sum_b V_b W_ib [kg], and where it is;
+    m_b = sum_i contact_i V_b W_ib of each sample, and the mass with which it answers, at least its own.
+    """
+    for s in range(sheets.count):
+        for vectors in ti.static((impulse, push, divergence_force, density_force)):
+            vectors[s] = ti.math.vec3(0.0)
     for i in range(fluid.particles.count):
         x_i = fluid.particles.position[i]
         field = 0.0
@@ -247,14 +282,9 @@ def weigh_contacts(fluid: Fluid, sheets: Sheets, full_field: ti.f32, contacts: C
                 r = distance((x_i - fluid.samples.position[b]).norm_sqr())
                 field += fluid.samples.volume[b] * spline(r * fluid.inverse_support)
         field *= fluid.sigma
-        mass = fluid.volume * fluid.materials.rest_density[fluid.particles.phase[i]]
+        mass_i = fluid.volume * fluid.materials.rest_density[fluid.particles.phase[i]]
         contacts.position[i] = x_i
-        contacts.mass[i] = ti.select(field > 0.0, mass / ti.max(field, full_field), 0.0)
-
-
-@kernel
-def gather_contact_mass(fluid: Fluid, near: NearParticles, sheets: Sheets, contact: Floats, mass: Floats):
-    """m_b = sum_i contact_i V_b W_ib: each sample's share of the fluid that touches sheets."""
+        contacts.mass[i] = ti.select(field > 0.0, mass_i / ti.max(field, full_field), 0.0)
     for s in range(sheets.count):
         b = sheets.first + s
         m = sheets.skipped + s
@@ -262,53 +292,62 @@ def gather_contact_mass(fluid: Fluid, near: NearParticles, sheets: Sheets, conta
         for k in range(near.start[m], near.start[m] + near.count[m]):
             i = near.particles[k]
             r = distance((fluid.particles.position[i] - fluid.samples.position[b]).norm_sqr())
-            total += contact[i] * spline(r * fluid.inverse_support)
-        mass[s] = fluid.sigma * fluid.samples.volume[b] * total
-
-
-@kernel
-def take_larger(values: Floats, other: Floats, count: ti.i32, larger: Floats):
-    """larger_s = max(values_s, other_s)."""
-    for s in range(count):
-        larger[s] = ti.max(values[s], other[s])
-
-
-@kernel
-def clear_vectors(vectors: Vectors, count: ti.i32):
-    """vector_s = 0."""
-    for s in range(count):
-        vectors[s] = ti.math.vec3(0.0)
-
-
-@kernel
-def count_impulses(force: Vectors, sheets: Sheets, dt: ti.f32, expected: Vectors, impulse: Vectors):
-    """Forces of a step, added to the impulses and to what is expected of the next step."""
-    for s in range(sheets.count):
-        impulse[s] += dt * force[sheets.skipped + s]
-        expected[s] += force[sheets.skipped + s]
+            total += contacts.mass[i] * spline(r * fluid.inverse_support)
+        mass_b = fluid.sigma * fluid.samples.volume[b] * total
+        mass[s] = mass_b
+        if ti.static(answers):
+            answering_mass[s] = ti.max(mass_b, own_mass[s])
 
 
 @kernel
 def push_sheet_samples(force: Vectors, sheets: Sheets, factor: ti.f32, mass: Floats, samples: Samples, push: Vectors):
     """v_b += factor f_b/m_b, and the sum of these pushes since the samples were placed."""
+    push_sheets(force, sheets, factor, mass, samples, push)
+
+
+@func
+def push_sheets(force: Vectors, sheets: Sheets, factor: ti.f32, mass: Floats, samples: Samples, push: Vectors):
+    """As `push_sheet_samples`."""
     for s in range(sheets.count):
         change = factor / mass[s] * force[sheets.skipped + s]
         samples.velocity[sheets.first + s] += change
         push[s] += change
 
 
-@kernel
-def accelerate_sheet_samples(force: Vectors, sheets: Sheets, mass: Floats, acceleration: Vectors):
+@func
+def react_of_sheets(
+    force: Vectors, sheets: Sheets, dt: ti.f32, reaction: SheetReaction, samples: Samples, answers: ti.template()
+):
+    """Count forces on the moving samples [N] for a step of dt [s]; those of sheets may answer to them."""
+    for s in range(sheets.count):
+        reaction.impulse[s] += dt * force[sheets.skipped + s]
+        reaction.expected[s] += force[sheets.skipped + s]
+    if ti.static(answers):
+        push_sheets(force, sheets, dt, reaction.mass, samples, reaction.push)
+
+
+@func
+def answer_of_sheets(force: Vectors, sheets: Sheets, mass: Floats, acceleration: Vectors):
     """a_b = f_b/m_b."""
     for s in range(sheets.count):
         acceleration[sheets.first + s] = force[sheets.skipped + s] / mass[s]
 
 
 @kernel
-def sum_sheet_gradients(
-    fluid: Fluid, near: NearParticles, sheets: Sheets, gradient_factor: ti.f32, mass: Floats, answer: Floats
+def add_sheets_to_diagonal(
+    fluid: Fluid,
+    near: NearParticles,
+    sheets: Sheets,
+    mass: Floats,
+    answer: Floats,
+    gradient_factor: ti.f32,
+    weight: ti.f32,
+    inverse_diagonal: Floats,
 ):
-    """V_b sum_i |V_b grad W_ib| / m_b: what a sample has in the bound of `add_sheets_to_diagonal`."""
+    """1/A_ii becomes 1/(A_ii + weight sum_b |n_ib| sum_j |n_jb| / m_b), n_ib = V_b grad W_ib.
+
+    What a sample has in it, V_b sum_j |n_jb| / m_b, is its `answer`.
+    """
     for s in range(sheets.count):
         x_b = fluid.samples.position[sheets.first + s]
         m = sheets.skipped + s
@@ -318,13 +357,6 @@ def sum_sheet_gradients(
             total -= spline_slope(r * fluid.inverse_support)
         v_b = fluid.samples.volume[sheets.first + s]
         answer[s] = gradient_factor * v_b * v_b * total / mass[s]
-
-
-@kernel
-def add_sheets_to_diagonal(
-    fluid: Fluid, sheets: Sheets, answer: Floats, gradient_factor: ti.f32, weight: ti.f32, inverse_diagonal: Floats
-):
-    """1/A_ii becomes 1/(A_ii + weight sum_b |n_ib| sum_j |n_jb| / m_b), n_ib = V_b grad W_ib."""
     for i in range(fluid.particles.count):
         x_i = fluid.particles.position[i]
         bound = 0.0

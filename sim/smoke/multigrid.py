@@ -15,6 +15,7 @@ import taichi as ti
 
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import bundle, func
+from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.scheduling import is_short
 from sim.smoke.arrays import new_floats
@@ -114,7 +115,7 @@ class MultigridVCycle:
         # The pseudo-inverse also serves regions without an open side, where A has the constants as its null space.
         matrix = operator_matrix(tuple(self._coarsest_conductance))
         inverse = np.linalg.pinv(matrix, rcond=1.0e-10, hermitian=True)
-        self.equation.coarsest_inverse.from_numpy(inverse.astype(np.float32).ravel())
+        put(self.equation.coarsest_inverse, inverse.ravel())
 
 
 @kernel

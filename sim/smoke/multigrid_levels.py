@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats
 from sim.core.bundles import bundle, func
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_faces, new_floats
 from sim.smoke.grid import Index3, SmokeGrid
@@ -152,7 +153,7 @@ class Coefficients:
         """Conductances on the coarsest level by axis, (3, nx + 2, ny + 2, nz + 2)."""
         coarsest = self.levels[-1]
         _copy_faces(self.operator.faces, coarsest.offset, coarsest.size, self._coarsest_faces)
-        faces: NDArray[np.float32] = self._coarsest_faces.to_numpy().reshape(3, *coarsest.padded)
+        faces: NDArray[np.float32] = copied(self._coarsest_faces).reshape(3, *coarsest.padded)
         return faces
 
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import bundle, func
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, State, new_faces
 from sim.smoke.grid import SmokeGrid
@@ -125,7 +126,7 @@ class Obstacles:
 
     def is_air(self) -> NDArray[np.bool_]:
         """Which cells are air now, (nx, ny, nz)."""
-        air: NDArray[np.bool_] = self.grid.trim(self.solids.state.to_numpy(), self.grid.cells) == AIR
+        air: NDArray[np.bool_] = self.grid.trim(copied(self.solids.state), self.grid.cells) == AIR
         return air
 
     def commit(self, density: ti.Ndarray) -> Change:

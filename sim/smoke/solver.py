@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats
 from sim.core.domain import DomainParameters
-from sim.core.host_access import viewed
+from sim.core.host_access import copied, viewed
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
@@ -286,10 +286,10 @@ class SmokeSolver:
         self._extrapolation.update()
 
     def _cells(self, name: str) -> NDArray[np.float32]:
-        return self.grid.trim(self._arrays[name].to_numpy(), self.grid.cells)
+        return self.grid.trim(copied(self._arrays[name]), self.grid.cells)
 
     def _faces(self, name: str, axis: int) -> NDArray[np.float32]:
-        return self.grid.trim(self._arrays[name].to_numpy(), self.grid.face_shape(axis))
+        return self.grid.trim(copied(self._arrays[name]), self.grid.face_shape(axis))
 
     def _buoyancy_bound(self, excess: float, density: float) -> float:
         if not self._has_gravity:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import bundle, func
 from sim.core.hashed_numbers import hash_to_unit, smooth_noise, spread
+from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.motion import rotation
 from sim.shapes.placement import build_solid
@@ -132,7 +133,7 @@ class Source:
                 self._faces, self._air.openness, self._air.state.velocity, strict=True
             ):
                 _set_faces(faces.indices, faces.values, openness, velocity, faces.count)
-        return float(self._emitted.to_numpy()[:blocks].sum(dtype=np.float64))
+        return float(copied(self._emitted)[:blocks].sum(dtype=np.float64))
 
     def _stay(self) -> None:
         grid, region = self._grid, build_solid(self.parameters)
