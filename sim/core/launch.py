@@ -28,7 +28,7 @@ from sim.core.bundles import field_paths, flattened, is_used, with_fields_as_arg
 _REAL_TYPES = frozenset(primitive_types.real_types)
 
 SLOW_S = 0.25
-"""A first call that takes longer has compiled its kernel, one that is faster has read it from Taichi's cache [s]."""
+"""A kernel whose source is read takes longer to compile, and less to be read from the cache of Taichi [s]."""
 _tell_compiled: list[Callable[[str, float], None]] = []
 
 MOST_LAUNCHES = 256  # most combinations of arrays whose launch context a kernel keeps
@@ -152,10 +152,12 @@ class FastKernel:
         flat = tuple(flattened(args))
         began = time.perf_counter()
         kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
+        traced = time.perf_counter()
         compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-        if (seconds := time.perf_counter() - began) > SLOW_S:
+        ended = time.perf_counter()
+        if ended - traced > SLOW_S:
             for tell in _tell_compiled:
-                tell(self.__name__, seconds)
+                tell(self.__name__, ended - began)
         result = self._primal(*flat)
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments

@@ -12,6 +12,7 @@ import taichi as ti
 
 from sim.core.arrays import Floats, Integers, LongIntegers
 from sim.core.bundles import func
+from sim.core.host_access import copied, put
 from sim.core.launch import kernel
 from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
 from sim.smoke.obstacles import AIR, Obstacles
@@ -57,9 +58,9 @@ class ClosedRegions:
         self._cells.fill(0)
         _list_roots(self._obstacles.box, self.number, self._roots, self._cells)
         # Threads list them in any order.
-        roots = self._roots.to_numpy()
+        roots = copied(self._roots)
         roots[: self.count].sort()
-        self._roots.from_numpy(roots)
+        put(self._roots, roots)
         self._cells.fill(0)
         _number_cells(self._obstacles.box, self.number, self.count, self._roots, self._cells)
 
@@ -74,9 +75,9 @@ class ClosedRegions:
         self._sums.fill(0)
         _sum_up(self._obstacles.box, self.number, values, 1.0 / unit, self._sums)
         means = np.zeros(self._means.shape[0], np.float32)
-        cells = self._cells.to_numpy()[: self.count]
-        means[: self.count] = self._sums.to_numpy()[: self.count] * unit / cells
-        self._means.from_numpy(means)
+        cells = copied(self._cells)[: self.count]
+        means[: self.count] = copied(self._sums)[: self.count] * unit / cells
+        put(self._means, means)
         _shift(self._obstacles.box, self.number, values, self._means)
         return float(np.abs(means).max())
 
