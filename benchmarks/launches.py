@@ -60,7 +60,7 @@ def main() -> dict[str, Any]:
     from sim.core.launch import FastKernel
 
     counter = Counter()
-    FastKernel.__call__ = counter.counted(FastKernel.__call__, lambda kernel, *_: kernel.__name__)  # type: ignore[method-assign]
+    FastKernel.__call__ = counter.counted(FastKernel.__call__, lambda kernel, *_: kernel.__name__)
     host_access._ask_driver = counter.counted(host_access._ask_driver, lambda function, *_: function)
     job = load_job(arguments.job)
     world = build_world(job, frames_per_second=job.fps)
