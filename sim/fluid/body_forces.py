@@ -69,6 +69,7 @@ class BodyForces:
     Attributes:
         near: particles near each moving sample.
         are_alone: whether no particle is near any moving sample, so that no forces act; until the next search.
+            Not said in the first step, which compiles what the first touch needs.
         response: answer of the bodies' samples to forces within the step; None where they wait for its end.
         sheets: forces on the samples of sheets; None where there are none.
     """
@@ -97,7 +98,7 @@ class BodyForces:
             particles=ti.ndarray(ti.i32, 1),
         )
         self._scratch = ti.ndarray(ti.i32, scan_scratch_length(samples))
-        self.are_alone = False
+        self.are_alone = self._are_compiled = False
         self.summed = Summed(
             ti.Vector.ndarray(3, ti.f32, samples), ti.ndarray(ti.f32, bodies * WRENCH_WIDTH), samples_of
         )
@@ -125,7 +126,7 @@ class BodyForces:
             if entries <= self.near.particles.shape[0]:
                 break
             self.near = self.near._replace(particles=ti.ndarray(ti.i32, int(entries * GROWTH)))
-        self.are_alone = entries == 0
+        self.are_alone = entries == 0 and self._are_compiled
 
     def let_bodies_respond(self, gravity: Vector3, discretization: Discretization) -> None:
         """From now on the bodies' samples, if there are any, answer to forces within the step."""
@@ -155,6 +156,7 @@ class BodyForces:
             sheets is not None and sheets.answers,
         )
         self._kept_dt.append(dt)
+        self._are_compiled = True
 
     def respond(self, exerted: Exerted) -> ti.Ndarray:
         """Acceleration of each boundary sample by forces that are only tried [m/s²]; their impulses do not count."""
