@@ -1,6 +1,8 @@
 """The page of a session: its scene and its controls. Callbacks only put requests into the session's queue."""
 
 import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,12 @@ from pipeline.web.serving import in_its_loop
 DECADE_STEP = 0.02
 """Of sliders over the powers of ten: 5 %."""
 
+NO_POWERS = (
+    "<style>form .mantine-Slider-root + *, form .mantine-Slider-label { display: none }"
+    " form .mantine-Slider-root { margin-bottom: 0.6rem }</style>"
+)
+"""Hides the numbers that viser puts beside and above a slider: here they are powers of ten. The form has the value."""
+
 
 class LivePage:
     """The page of a session, which all browsers share; jobs are saved in the folder. Made in the server's loop."""
@@ -24,11 +32,12 @@ class LivePage:
     def __init__(self, server: viser.ViserServer, session: Session, recorder: Recorder, folder: Path) -> None:
         self._server, self._session, self._recorder, self._folder = server, session, recorder, folder
         self._written = recorder.loaded.job
-        self._sliders: dict[str, tuple[Parameter, Any]] = {}
+        self._show_value: dict[str, Callable[[Value], None]] = {}
         self._revision = session.revision
         gui = server.gui
         gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
+        gui.add_html(NO_POWERS)
         self._notice = gui.add_markdown("")
         self._state = gui.add_markdown("")
         self._changes = gui.add_markdown("")
@@ -64,12 +73,8 @@ class LivePage:
         self._notice.content = f"**{_plain(self._session.message)}**" if self._session.message else ""
         if self._session.revision != self._revision:
             self._revision = self._session.revision
-            for name, (parameter, handle) in self._sliders.items():
-                shown = _shown(parameter, self._session.values[name])
-                if handle.value != shown:
-                    handle.value = shown
-                if parameter.widget == "decades":
-                    handle.label = _label(parameter, self._session.values[name])
+            for name, show in self._show_value.items():
+                show(self._session.values[name])
 
     # --- what it is made of ---
 
@@ -103,24 +108,50 @@ class LivePage:
                 step=0.1 if parameter.high <= 100.0 else 1.0,
             )
         elif parameter.widget == "decades":
-            low, high = math.log10(parameter.low), math.log10(parameter.high)
-            marks = ((low, f"{parameter.low:.0e}"), (high, f"{parameter.high:.0e}"))
-            hint = f"{parameter.name}: the slider has the power of ten"
-            label, shown = _label(parameter, start), _shown(parameter, start)
-            handle = gui.add_slider(label, low, high, DECADE_STEP, shown, marks=marks, hint=hint)
+            self._add_decades(gui, parameter, start)
+            return
         else:
             step = 1 if parameter.widget == "whole" else (parameter.high - parameter.low) / 200.0
             handle = gui.add_slider(parameter.label, parameter.low, parameter.high, step, start, hint=parameter.name)
 
         async def on_update(event: Any) -> None:
             if event.client is not None:  # not what `tell` has set
-                value = _meant(parameter, handle.value)
+                shown = handle.value
+                value = tuple(map(float, shown)) if parameter.widget == "vector" else shown
                 self._session.ask(self._session.set, parameter.name, value)
-                if parameter.widget == "decades":  # the session may refuse it, and `tell` puts it right then
-                    handle.label = _label(parameter, value)
 
         handle.on_update(on_update)
-        self._sliders[parameter.name] = (parameter, handle)
+        self._show_value[parameter.name] = partial(_put, handle)
+
+    def _add_decades(self, gui: Any, parameter: Parameter, start: Value) -> None:
+        """A field with the value, which is taken with Enter, over a slider of its power of ten."""
+        low, high = math.log10(parameter.low), math.log10(parameter.high)
+        marks = ((low, f"{parameter.low:g}"), (high, f"{parameter.high:g}"))
+        with gui.add_form(None) as form:
+            text = gui.add_text(parameter.label, f"{start:g}", hint=f"{parameter.name}: Enter takes what is typed")
+            slider = gui.add_slider("", low, high, DECADE_STEP, _power(parameter, start), marks=marks)
+
+        def show(value: Value) -> None:
+            _put(text, f"{value:g}")
+            _put(slider, _power(parameter, value))
+
+        async def on_slide(event: Any) -> None:
+            if event.client is not None:
+                # rounding at the ends is no way out of the range
+                value = min(max(float(f"{10.0**slider.value:.3g}"), parameter.low), parameter.high)
+                _put(text, f"{value:g}")  # the session may refuse it, and `tell` puts it right then
+                self._session.ask(self._session.set, parameter.name, value)
+
+        def take(typed: str) -> None:
+            self._session.set(parameter.name, _number(typed))
+            in_its_loop(self._server, show, self._session.values[parameter.name])
+
+        async def on_enter(_: Any) -> None:
+            self._session.ask(take, text.value)
+
+        slider.on_update(on_slide)
+        form.on_submit(on_enter)
+        self._show_value[parameter.name] = show
 
     def _dragged(self, kind: str, name: str, event: Any) -> None:
         ask, drags = self._session.ask, self._session.drags
@@ -132,27 +163,24 @@ class LivePage:
             ask(drags.move, kind, name, event.end_position, event.client_id)
 
 
-def _shown(parameter: Parameter, value: Value) -> Any:
-    """A value as its widget has it: no rounding leads past the ends, which a slider refuses."""
-    if parameter.widget != "decades":
-        return value
+def _put(handle: Any, shown: Any) -> None:
+    """Have a widget show something; only news are sent."""
+    if handle.value != shown:
+        handle.value = shown
+
+
+def _power(parameter: Parameter, value: Value) -> float:
+    """The power of ten of a value: no rounding leads past the ends of the range, which a slider refuses."""
     assert isinstance(value, float)
     return min(max(round(math.log10(max(value, 1e-300)), 2), math.log10(parameter.low)), math.log10(parameter.high))
 
 
-def _label(parameter: Parameter, value: object) -> str:
-    """A parameter's label with its value: a power of ten alone says little."""
-    name, bracket, unit = parameter.label.partition(" [")
-    assert isinstance(value, float)
-    written = f"{float(f'{value:.3g}'):.6g}"
-    return f"{name} {written}{' ' if bracket else ''}{unit.rstrip(']')}"
-
-
-def _meant(parameter: Parameter, shown: Any) -> object:
-    """The value of a widget; rounding at the ends is no way out of the range."""
-    if parameter.widget == "decades":
-        return min(max(float(f"{10.0**shown:.3g}"), parameter.low), parameter.high)
-    return tuple(map(float, shown)) if parameter.widget == "vector" else shown
+def _number(typed: str) -> float | str:
+    """A typed number; what is none is left for the session to refuse."""
+    try:
+        return float(typed)
+    except ValueError:
+        return typed
 
 
 def _written(session: Session) -> str:

@@ -34,6 +34,11 @@ def opened(page: Page, address: str) -> Page:
     return page
 
 
+def stiffness_in(page: Page) -> str:
+    """What the field of the sheet's stiffness shows."""
+    return page.locator("form").filter(has_text="stretch stiffness").get_by_role("textbox").first.input_value()
+
+
 def frame_of(session: Session) -> int:
     """How far the scene is, as another thread may ask; -1 while the session builds its world anew."""
     world = getattr(session, "world", None)
@@ -54,7 +59,7 @@ def two_play(address: str, session: Session) -> None:
             first.keyboard.press("ArrowLeft")
         until(lambda: session.values["cloth.sheet.stretch_stiffness"] < 0.9 * before, "the slider does nothing")
         turned = session.values["cloth.sheet.stretch_stiffness"]
-        other.get_by_text(f"stretch stiffness {turned:.3g} N/m").wait_for()
+        until(lambda: stiffness_in(other) == f"{turned:g}", "the other browser does not show it")
 
         other.get_by_role("button", name="Go on").click()
         first.get_by_role("button", name="Pause").click()
@@ -70,7 +75,7 @@ def two_play(address: str, session: Session) -> None:
             page.get_by_text("It blew up").wait_for()
             page.get_by_text("Changed last: cloth.sheet.stretch_stiffness = 100000").wait_for()
             page.get_by_role("button", name="Go on").wait_for()  # at the start, with the job's values
-        first.get_by_text("stretch stiffness 500 N/m").wait_for()
+        until(lambda: stiffness_in(first) == "500", "the job's value is not shown")
 
         other_place.close()  # gone in the middle, with everything that it was shown
         frame = frame_of(session)

@@ -13,6 +13,7 @@ import pytest
 from browser import PATIENCE_S, needs_browser, open_page, until
 from live_jobs import BALL_OVER_SHEET, served
 from PIL import Image
+from playwright.sync_api import Page
 
 from pipeline.web.live.running import run
 from pipeline.web.live.session import Session
@@ -81,6 +82,7 @@ def play(address: str, session: Session, folder: Path) -> None:
         for _ in range(10):
             page.keyboard.press("ArrowLeft")
         until(lambda: session.values["cloth.sheet.stretch_stiffness"] < 0.8 * before, "the slider does nothing")
+        type_a_stiffness(page, session)
         page.get_by_role("button", name="Save as job").click()
         until((folder / "drape-live.toml").exists, "nothing was saved")
         page.get_by_text("drape-live.toml").wait_for()
@@ -94,6 +96,32 @@ def play(address: str, session: Session, folder: Path) -> None:
         until(lambda: session.world.frame == 0, "it was not reset")
         time.sleep(1.0)  # until the ball is seen where it was
         drag_up(BALL, kind="rigid", name="ball")  # and the browser is closed
+
+
+def type_a_stiffness(page: Page, session: Session) -> None:
+    """The field shows the value in its unit and takes one; no powers of ten are seen; what is no value is refused."""
+    name, label = "cloth.sheet.bend_stiffness", "bend stiffness [N m]"
+    field = page.locator("form").filter(has_text=label).get_by_role("textbox").first
+    slider = page.locator("form").filter(has_text=label).get_by_role("slider")
+    assert float(field.input_value()) == pytest.approx(session.values[name], rel=1e-5)
+    page.wait_for_timeout(200.0)  # viser's page may drop what comes within 50 ms of another control's change
+    field.fill("2.5e-4")
+    field.press("Enter")
+    until(lambda: session.values[name] == 2.5e-4, "the field does nothing")
+    until(lambda: float(slider.get_attribute("aria-valuenow")) == pytest.approx(-3.6), "the slider stays")
+    slider.focus()
+    slider.press("ArrowRight")
+    until(lambda: field.input_value() == "0.000263", "the field does not follow the slider")
+    until(lambda: session.values[name] == 2.63e-4, "the slider does nothing")
+    for refused in ("soft", "7", "nan"):
+        page.wait_for_timeout(200.0)
+        field.fill(refused)
+        field.press("Enter")
+        page.get_by_text(f"must lie between 1e-08 and 0.1, got {refused}").wait_for()
+        until(lambda: field.input_value() == "0.000263", "a refused value stays in the field")
+    shown = [float(box.input_value()) for box in page.get_by_role("textbox").all() if box.is_visible()]
+    assert len(shown) > 8
+    assert not [value for value in shown if value < 0.0 and value not in session.values["gravity"]]
 
 
 @needs_browser
