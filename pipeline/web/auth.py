@@ -48,10 +48,6 @@ POLICY = "; ".join(
         "frame-ancestors 'none'",
     )
 )
-REPORT_POLICY = (
-    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; frame-ancestors 'none'; sandbox"
-)
-"""A report carries its own style, pictures and film. It lies in a job's folder, so nothing in it is run."""
 HEADERS = {
     "content-security-policy": POLICY,
     "x-content-type-options": "nosniff",

@@ -15,10 +15,16 @@ from pipeline.job.loading import load_job
 from pipeline.record.reader import StageTiming
 from pipeline.run.plan import frame_ranges
 from pipeline.run.solver_numbers import unreadable_whitewater
-from pipeline.show.report.chart import line_chart, swatch
+from pipeline.show.report.chart import chart, scripts, style
 from pipeline.show.report.film import ReportFilm, as_address
 from pipeline.show.report.job_report import JobReport, MadeWith, gather
 from pipeline.show.report.panels import Panel, panels_of
+
+TIME = "simulated time [s]"
+HANDLING = (
+    "A drag zooms all charts, a double click shows all again; a click on a name hides its line."
+    "<noscript> Charts need JavaScript, which is off here; their numbers are in this file.</noscript>"
+)
 
 
 def write_report(layouts: Sequence[JobLayout], path: Path) -> None:
@@ -47,14 +53,18 @@ def page(reports: Sequence[JobReport], *, written: str) -> str:
         *sections,
         _section("What it was made of", "".join(origins_section(each, headed=several) for each in reports)),
     ]
-    style = files(__package__).joinpath("report.css").read_text(encoding="utf-8")
+    looks = style() + files(__package__).joinpath("report.css").read_text(encoding="utf-8")
+    charts = [chart(each.lines, x_label=TIME, may_be_logarithmic=each.logarithmic) for each in found.panels]
+    uplot, drawing = scripts()
     data = _json({"written": written, "jobs": [report.as_json() for report in reports]})
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{style}</style>\n</head>\n<body>\n"
+        f"<style>{looks}</style>\n</head>\n<body>\n"
         + "\n".join(body)
-        + f'\n<script type="application/json" id="numbers">{data}</script>\n</body>\n</html>\n'
+        + f'\n<script type="application/json" id="numbers">{data}</script>\n'
+        + f'<script type="application/json" id="charts">{_json(charts)}</script>\n'
+        + f"<script>{uplot}</script>\n<script>{drawing}</script>\n</body>\n</html>\n"
     )
 
 
@@ -77,18 +87,15 @@ def _energies(reports: Sequence[JobReport]) -> str:
 
 
 def _charts(panels: Iterable[Panel], zero: Sequence[str]) -> str:
-    figures = "".join(_figure(panel) for panel in panels)
+    figures = "".join(f"<figure><figcaption>{escape(_titled(panel))}</figcaption></figure>" for panel in panels)
     if not figures:
         return '<p class="quiet">No frame has been simulated yet.</p>'
     note = f'<p class="quiet">Zero in every frame: {escape("; ".join(zero))}.</p>' if zero else ""
-    return f'<div class="charts">{figures}</div>{note}'
+    return f'<p class="quiet">{HANDLING}</p><div class="charts">{figures}</div>{note}'
 
 
-def _figure(panel: Panel) -> str:
-    unit = f" [{panel.unit}]" if panel.unit else ""
-    legend = "".join(f"<li>{swatch(line)}{escape(line.label)}</li>" for line in panel.lines)
-    chart = line_chart(panel.lines, x_label="simulated time [s]", may_be_logarithmic=panel.logarithmic)
-    return f"<figure><figcaption>{escape(panel.title + unit)}</figcaption><ul>{legend}</ul>{chart}</figure>"
+def _titled(panel: Panel) -> str:
+    return f"{panel.title} [{panel.unit}]" if panel.unit else panel.title
 
 
 def _section(title: str, content: str) -> str:

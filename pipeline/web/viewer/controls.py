@@ -7,7 +7,7 @@ import viser
 
 from pipeline.model.job import Job
 from pipeline.web.drawing.bodies import PLAIN, POINTS, SLICE, SPEED, Look, has_form
-from pipeline.web.viewer.numbers import SolverSeries, label
+from pipeline.web.viewer.numbers import SolverSeries, label, plot_data, plot_series
 from pipeline.web.viewer.scene import SURFACES
 from pipeline.web.viewer.texts import NO_FRAME
 
@@ -30,7 +30,7 @@ class Controls:
         self.play = gui.add_button("Play")
         self.steps = gui.add_button_group("Step", ("first", "back", "next", "last"))
         self.plotted: Any = gui.add_dropdown("Plot", (NO_FRAME,), initial_value=NO_FRAME)
-        self.plot = gui.add_html("")
+        self.plot: Any = gui.add_uplot(plot_data((), (), None), plot_series(""), height=200, visible=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Shown"):
             self._layer_folder = gui.add_folder("Things")
@@ -68,6 +68,15 @@ class Controls:
     def chosen_numbers(self) -> tuple[str, str] | None:
         """Solver and name of the plotted number."""
         return self._choices.get(self.plotted.value)
+
+    def show_plot(self, series: SolverSeries, frame: int | None, *, last: int) -> None:
+        """Plot the chosen number with a mark at the frame, on an axis up to the last one; a zoom of a page stays."""
+        chosen = self.chosen_numbers()
+        self.plot.visible = chosen is not None
+        if chosen is not None:
+            self.plot.series = plot_series(label(*chosen))
+            self.plot.scales = {"x": {"time": False, "range": (0, max(last, 1))}}
+            self.plot.data = plot_data(*series.of(*chosen), frame)
 
     def go_to(self, frame: int | None) -> None:
         """Put the slider at a frame."""

@@ -3,19 +3,16 @@
 import math
 from collections.abc import Sequence
 from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.base.quantities import in_order, quantity, with_energy
-from pipeline.show.report.chart import Line, line_chart
 from pipeline.store.cache import FrameNumbers
 
 FIRST_CHOICES = ("kinetic_energy", "density_error", "divergence", "iterations", "max_speed")
 """Plotted before anybody chooses: the first of these that there is."""
-PLOT_STYLE = (
-    "<style>.plot{font-size:12px;padding:0 .8em}.plot svg{display:block;width:100%;font:17px system-ui}"
-    ".plot .tick{fill:currentColor;opacity:.7}.plot .grid,.plot .axis{stroke:currentColor;opacity:.2}"
-    ".plot .line{fill:none;stroke-width:3;stroke-linejoin:round}"
-    ".plot .c0{stroke:none}.plot .c1{stroke:#3f97e0}.plot .c2{stroke:#f08a3c}</style>"
-)
 TABLE_STYLE = (
     "<style>.numbers{font-size:12px;line-height:1.35;padding:0 .8em}.numbers table{width:100%;margin:.1em 0 .7em}"
     ".numbers td{padding:0}.numbers td+td{text-align:right;font-variant-numeric:tabular-nums}</style>"
@@ -105,14 +102,20 @@ def table(numbers: FrameNumbers) -> str:
     return f'{TABLE_STYLE}<div class="numbers">{"".join(parts)}</div>'
 
 
-def plot(frames: Sequence[int], values: Sequence[float], *, current: int | None, last: int) -> str:
-    """A finite number over rising frames as HTML, with a mark at the current one; the axis ends at the last."""
-    if not frames:
-        return f'{PLOT_STYLE}<div class="plot" style="opacity:.6">nothing to plot yet</div>'
-    whole = Line("the film", [0, max(last, 1)], [0.0, 0.0])  # not drawn, but the axes hold it
-    lines, told = [whole, Line("values", frames, values, color=1)], ""
-    if current is not None:
-        lines.append(Line("now", [current, current], [min(0.0, *values), max(0.0, *values)], color=2))
-        if current in frames:
-            told = f"frame {current}: {values[frames.index(current)]:.4g}"
-    return f'{PLOT_STYLE}<div class="plot">{line_chart(lines, x_label=f"frames 0 to {last}")}{told}</div>'
+def plot_data(frames: Sequence[int], values: Sequence[float], current: int | None) -> tuple[NDArray[np.float64], ...]:
+    """A finite number over rising frames as uPlot takes it: frames, values, and values up to the current frame.
+
+    These stay at the current frame's value after it, as uPlot's scales bear no NaN.
+    """
+    x, y = np.asarray(frames, float), np.asarray(values, float)
+    now = frames.index(current) if current in frames else -1
+    return x, y, y[np.clip(np.arange(len(y)), 0, now)] if now >= 0 else y
+
+
+def plot_series(name: str) -> tuple[Any, ...]:
+    """What uPlot draws of `plot_data`: the number, and over it how far the film is and at what value."""
+    return (
+        {"label": "frame"},
+        {"label": name, "stroke": "#3f97e0", "width": 1.5},
+        {"label": "up to this frame", "stroke": "#f08a3c", "width": 1.5, "points": {"show": False}},
+    )

@@ -26,7 +26,7 @@ from pipeline.web.serving import in_its_loop
 from pipeline.web.viewer.committed import CommittedFrames, Stamp, artifacts_of_frame
 from pipeline.web.viewer.controls import Controls
 from pipeline.web.viewer.frames import ShownFrame, read_shown_frame
-from pipeline.web.viewer.numbers import SolverSeries, plot, table
+from pipeline.web.viewer.numbers import SolverSeries, table
 from pipeline.web.viewer.playback import Playback
 from pipeline.web.viewer.scene import CAMERA, SURFACES, JobScene
 from pipeline.web.viewer.texts import lacking, legend, notice, thinned, title
@@ -221,8 +221,7 @@ class ViewPage:
         panel = (frame, chosen, self._series.version, count)
         if panel != self._panel:
             self._panel = panel
-            values = self._series.of(*chosen) if chosen is not None else ([], [])
-            controls.plot.content = plot(*values, current=frame, last=count - 1)
+            controls.show_plot(self._series, frame, last=count - 1)
             numbers = self._series.numbers(frame)
             controls.table.content = "" if numbers is None else table(numbers)
 

@@ -329,7 +329,7 @@ def test_answers_carry_a_policy_and_pages_name_no_other_place(farm: Farm) -> Non
             assert " style=" not in answer.text
             assert "<script>" not in answer.text
         policy = client.ask("/jobs/a/report").headers["content-security-policy"].split("; ")
-        assert {"default-src 'none'", "img-src data:", "media-src data:", "sandbox"} <= set(policy)
+        assert {"default-src 'none'", "img-src data:", "media-src data:", "sandbox allow-scripts"} <= set(policy)
         for name in ("page.js", "morph.js", "viewer.js", "page.css"):
             assert "://" not in client.ask(f"/static/{name}").text
 

@@ -9,11 +9,13 @@ from browser import PATIENCE_S, needs_browser, open_page
 from browser import until as wait_for
 from dashboards import dashboard, draw_frame, frame_job
 from farm_processes import Farm, wait_until
+from numbered_frames import commit, submitted
 from playwright.sync_api import Page
 
 from pipeline.queue.job_queue import Desired, new_entry
 from pipeline.record.manifest import Manifest
 from pipeline.show.report.film import as_address
+from pipeline.show.report.page import write_report
 
 pytestmark = needs_browser
 PATIENCE_MS = 1000 * PATIENCE_S
@@ -88,6 +90,20 @@ def test_the_film_in_a_report_is_let_through(farm: Farm) -> None:
         assert page.evaluate(
             "[document.querySelector('video').videoWidth, !document.querySelector('video').error]"
         ) == [64, True]
+
+
+def test_a_report_draws_its_charts_and_runs_no_script_of_others(farm: Farm) -> None:
+    layout = farm.layout("film")
+    submitted(layout.root)
+    for frame in range(3):
+        commit(layout, frame, kinetic_energy=float(frame), potential_energy=2.0)
+    write_report([layout], layout.report)
+    text = layout.report.read_text()
+    layout.report.write_text(text.replace("</body>", "<script>document.title = 'taken over'</script></body>"))
+    with dashboard(farm) as (client, _), open_page() as page:
+        page.goto(f"http://{client.place}/jobs/film/report")
+        until(page, "document.querySelectorAll('figure canvas').length > 2")
+        assert page.title() == "tank"
 
 
 def test_tasks_are_found_and_their_logs_read_while_what_is_typed_stays(farm: Farm) -> None:

@@ -116,6 +116,8 @@ def test_a_job_is_drawn_scrubbed_and_played_in_two_pages(tmp_path: Path, window:
             "/camera",
             "/whitewater/water",
         } == view.page.canvas.names
+        plotted = "Object.values(window.__viserTestpoints.uplots).map(each => each.chart.scales.y.max > 0)"
+        wait_for(lambda: browser.evaluate(plotted) == [True], "a plot of the numbers", browser)
         assert browser.get_by_text("500 of 1,000 particles are drawn").is_visible()
 
         track = browser.locator(".mantine-Slider-track").first.bounding_box()
