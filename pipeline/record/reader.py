@@ -107,6 +107,14 @@ class StageTiming(NamedTuple):
     bytes: int
 
 
+class StoredFile(NamedTuple):
+    """An artifact as it stands on disk."""
+
+    path: ArtifactPath
+    mtime_ns: int  # its modification time [ns since the epoch]
+    is_old: bool  # whether an earlier run made it: the plan is to make it anew, or has its stage and it no more
+
+
 class LastRun(NamedTuple):
     """The last run of the job: the token of its lease, and how it ended."""
 
@@ -345,24 +353,33 @@ class ManifestReader:
         """Number of frames of the planned tasks."""
         return int(self._rows("SELECT coalesce(max(frame) + 1, 0) FROM task WHERE position IS NOT NULL")[0][0])
 
-    def newest_in(self, folder: str, suffix: str, *, limit: int, offset: int = 0) -> list[tuple[ArtifactPath, int]]:
-        """Artifacts right in a folder of the job, the newest first, each with its modification time [ns]."""
-        rows = self._rows(
-            "SELECT path, mtime_ns FROM artifact WHERE path > ?1 || '/' AND path < ?1 || '0'"  # 0 follows / in ASCII
-            " AND substr(path, -length(?2)) = ?2 ORDER BY mtime_ns DESC, path DESC LIMIT ?3 OFFSET ?4",
-            (folder, suffix, limit, offset),
-        )
-        return [(ArtifactPath(path), int(mtime_ns)) for path, mtime_ns in rows]
+    def newest_in(self, folder: str, suffix: str, *, limit: int, offset: int = 0) -> list[StoredFile]:
+        """Artifacts right in a folder of the job, the newest first."""
+        return self._newest_in(folder, suffix, limit, offset)[0]
 
-    def newest_and_count_in(self, folder: str, suffix: str) -> tuple[tuple[ArtifactPath, int] | None, int]:
+    def newest_and_count_in(self, folder: str, suffix: str) -> tuple[StoredFile | None, int]:
         """The first one that `newest_in` tells, or None, and of how many."""
+        files, count = self._newest_in(folder, suffix, 1, 0)
+        return next(iter(files), None), count
+
+    def is_old(self, artifact: ArtifactPath) -> bool:
+        """Whether an artifact is there that an earlier run made; see `StoredFile`."""
+        return any(file.is_old for file in self._newest_in(artifact, "", 1, 0)[0])
+
+    def _newest_in(self, place: str, suffix: str, limit: int, offset: int) -> tuple[list[StoredFile], int]:
+        """Artifacts that are a place or right in it, the newest first, and how many there are in all."""
         rows = self._rows(
-            "SELECT path, max(mtime_ns), count(*) FROM artifact WHERE path > ?1 || '/' AND path < ?1 || '0'"
-            " AND substr(path, -length(?2)) = ?2",  # beside max() SQLite takes the path from its row
-            (folder, suffix),
+            "SELECT path, mtime_ns, CASE WHEN task.position IS NOT NULL THEN task.state NOT IN (?5, ?6)"
+            "   ELSE EXISTS (SELECT 1 FROM task AS other WHERE other.stage = task.stage AND other.position IS NOT NULL)"
+            "   END, count(*) OVER ()"
+            " FROM artifact JOIN task ON task.id = artifact.task"
+            " WHERE path = ?1 OR (path > ?1 || '/' AND path < ?1 || '0'"  # 0 follows / in ASCII
+            "   AND substr(path, -length(?2)) = ?2)"
+            " ORDER BY mtime_ns DESC, path DESC LIMIT ?3 OFFSET ?4",
+            (place, suffix, limit, offset, TaskState.SUCCEEDED, TaskState.UP_TO_DATE),
         )
-        path, mtime_ns, count = rows[0]
-        return None if path is None else (ArtifactPath(path), int(mtime_ns)), int(count)
+        files = [StoredFile(ArtifactPath(path), int(mtime_ns), bool(is_old)) for path, mtime_ns, is_old, _ in rows]
+        return files, int(rows[0][3]) if rows else 0
 
     def task_page(
         self,

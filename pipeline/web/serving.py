@@ -281,10 +281,12 @@ def refusal(headers: Headers, access: Access) -> str | None:
 
 
 class _OneLine(logging.Filter):
-    """Errors of connections without their tracebacks."""
+    """Errors of connections without their tracebacks; nothing of what was no request, as of a scan of ports."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Put what a message has raised in place of the traceback; every record is printed."""
+        """Put what a message has raised in place of the traceback."""
+        if record.getMessage() == "opening handshake failed":
+            return False
         if record.exc_info and record.exc_info[1] and record.getMessage() == "connection handler failed":
             record.msg, record.args = _not_understood(record.exc_info[1]), ()
             record.exc_info = record.exc_text = None

@@ -24,6 +24,7 @@ from render.errors import InvalidFileError
 from render.sheet import contact_sheet
 from render.temporary_folder import temporary_folder
 
+LEFT = "particles_removed"  # of a fluid's diagnostics: those that passed an open face, since the start
 SHEET_PICTURES, SHEET_COLUMNS = 12, 4
 SHEET_WIDTH = 1200  # at most [pixels]; small pictures are not enlarged
 
@@ -76,7 +77,12 @@ class JobReport:
         for _, kind, body in bodies(job):
             if fact := kind.facts(body, self._particle_count(body.name)):
                 facts[body.name] = fact
-        return facts
+        left = [
+            f"{int(of[LEFT]):,} {'particle' if of[LEFT] == 1 else 'particles'} of {solver.replace('+', ' and ')}"
+            for solver, of in (frames[-1].solvers if frames else {}).items()
+            if of.get(LEFT)
+        ]
+        return {**facts, "left the domain": ", ".join(left)} if left else facts
 
     def _particle_count(self, fluid: str) -> float | None:
         """Particles of a fluid in the last frame: of its own solver, or its part of those that share one."""

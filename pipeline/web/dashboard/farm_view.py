@@ -15,7 +15,7 @@ from pipeline.queue.job_queue import JobQueue, QueuedJob
 from pipeline.queue.listing import state_by_record
 from pipeline.queue.states import JobState, state_of
 from pipeline.record.glance import Version, glance, version_of
-from pipeline.record.reader import AttemptRow, LastRun, ManifestReader, StageSummary
+from pipeline.record.reader import AttemptRow, LastRun, ManifestReader, StageSummary, StoredFile
 from pipeline.web.dashboard.estimates import LongTask, Remaining, StageRow, remaining, stage_rows
 from pipeline.web.dashboard.places import NotThereError, Places, printable
 
@@ -35,6 +35,7 @@ class Picture(NamedTuple):
 
     frame: int
     version: int
+    is_old: bool  # whether an earlier run drew it, and it is to be drawn anew or is none of the job's any more
 
 
 @dataclass(frozen=True)
@@ -250,16 +251,16 @@ def read_record(manifest: ManifestReader, *, runs: bool) -> Record:
         last_run=manifest.last_run(),
         is_empty=manifest.is_empty(),
         running=running,
-        picture=None if picture is None else picture_of(*picture),
+        picture=None if picture is None else picture_of(picture),
         pictures=pictures,
         left=remaining(rows, busy_s, window_s) if runs else None,
     )
 
 
-def picture_of(artifact: str, mtime_ns: int) -> Picture | None:
+def picture_of(file: StoredFile) -> Picture | None:
     """A frame by its artifact; None if its name is no number."""
-    stem = Path(artifact).stem
-    return Picture(int(stem), mtime_ns) if stem.isdecimal() else None
+    stem = Path(file.path).stem
+    return Picture(int(stem), file.mtime_ns, file.is_old) if stem.isdecimal() else None
 
 
 def _long_tasks(

@@ -73,6 +73,7 @@ class Film(NamedTuple):
     finished: bool  # whether it is the whole film, not what there is so far
     size: int  # [bytes]
     is_playable: bool  # whether browsers play it; H.265 and ProRes they do not
+    is_old: bool = False  # whether an earlier run made it, and it is to be made anew
 
 
 class Work(NamedTuple):
@@ -126,9 +127,11 @@ class _Found(NamedTuple):
     events: list[EventRow]
     row: TaskRow | None
     attempts: list[AttemptRow]
+    old_films: tuple[str, ...]
 
 
-_NOTHING = _Found(TaskPage([], 0), [], [], None, [])
+MOVIES = tuple(JobLayout.movie(suffix) for suffix in (".mp4", ".mov"))
+_NOTHING = _Found(TaskPage([], 0), [], [], None, [], ())
 
 
 def look_at_job(places: Places, card: JobCard, question: Question) -> JobDetail:
@@ -144,7 +147,7 @@ def look_at_job(places: Places, card: JobCard, question: Question) -> JobDetail:
         tasks=found.tasks,
         story=_story(places, card, question, found),
         pictures=found.pictures,
-        film=film_of(places, card),
+        film=_dated(film_of(places, card), card, found),
         has_report=places.has(card.name, layout.report.name),
         events=found.events[::-1],
         work=_work(card),
@@ -168,10 +171,11 @@ def _ask(manifest: ManifestReader, question: Question) -> _Found:
         )
     return _Found(
         tasks=tasks,
-        pictures=[picture for each in pictures if (picture := picture_of(*each)) is not None],
+        pictures=[picture for each in pictures if (picture := picture_of(each)) is not None],
         events=manifest.events(limit=EVENTS),
         row=row,
         attempts=[] if row is None else manifest.history(row.task)[::-1],
+        old_films=tuple(movie for movie in MOVIES if manifest.is_old(movie)),
     )
 
 
@@ -207,7 +211,7 @@ def film_of(places: Places, card: JobCard) -> Film | None:
     """The finished film of a job that is done, else the newer one of a film and the film so far."""
     so_far = JobLayout(places.farm / card.name).preview_movie.name
     films = []
-    for name in (*(str(JobLayout.movie(suffix)) for suffix in (".mp4", ".mov")), so_far):
+    for name in (*MOVIES, so_far):
         with suppress(NotThereError, OSError):  # one goes in this moment, as at the end of a run
             status = places.file(card.name, name).stat()
             finished = name != so_far
@@ -215,6 +219,15 @@ def film_of(places: Places, card: JobCard) -> Film | None:
             is_playable = not finished or (not name.endswith(".mov") and _codec(places, card.name) in PLAYABLE)
             films.append(Film(name, status.st_mtime_ns, finished, status.st_size, is_playable))
     return max(films, key=lambda film: (card.state == "done" and film.finished, film.version), default=None)
+
+
+def _dated(film: Film | None, card: JobCard, found: _Found) -> Film | None:
+    """A film that knows whether it is old; the film so far is as old as the newest frame, and is remade with it."""
+    if film is None:
+        return None
+    newest = card.record.picture
+    is_old = film.path in found.old_films if film.finished else newest is not None and newest.is_old
+    return film._replace(is_old=is_old)
 
 
 def _codec(places: Places, name: str) -> str:

@@ -1,7 +1,6 @@
 """Pages and their parts, from templates that escape whatever they are given."""
 
 import hashlib
-from datetime import UTC, datetime
 from importlib.resources import files
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlencode
@@ -49,7 +48,7 @@ class Pages:
             auto_reload=False,
         )
         self._environment.filters.update(
-            duration=wording.duration, size=wording.size, moment=wording.moment, clock=clock, about=about, reason=reason
+            duration=wording.duration, size=wording.size, moment=wording.moment, about=about, reason=reason
         )
         self._environment.globals.update(job_url=job_url, query=query, static=self._static_url)
         self.static = _static_files()
@@ -83,12 +82,6 @@ def query(question: Question, **changes: object) -> str:
     asked = question._replace(**changes)  # type: ignore[arg-type]
     said = {key: value for key, value in asked._asdict().items() if value != getattr(usual, key)}
     return f"?{urlencode(said)}" if said else "?"
-
-
-def clock(time_s: float) -> str:
-    """A wall time [s since the epoch]: the time of day, and before today the date, too."""
-    moment, today = datetime.fromtimestamp(time_s, UTC).astimezone(), datetime.now(UTC).astimezone().date()
-    return moment.strftime("%H:%M:%S" if moment.date() == today else "%d %b %H:%M")
 
 
 def about(seconds: float) -> str:

@@ -254,6 +254,14 @@ def test_the_facts_have_the_particles_of_each_fluid_of_a_tank(layout):
     assert "<dt>oil</dt><dd>WCSPH, 300 particles of radius" in text
 
 
+def test_the_facts_count_the_particles_that_left_the_domain(layout):
+    assert "left the domain" not in report_of(layout)[0]
+    commit(layout, 3, particle_count=1300.0, particles_removed=1234.0)
+    text, _ = report_of(layout)
+    assert "<dt>left the domain</dt><dd>1,234 particles of water</dd>" in text
+    assert "Particles that left" in re.findall(r"<figcaption>([^<]*)</figcaption>", text)
+
+
 def test_the_report_warns_of_whitewater_that_had_no_room_or_is_damaged(layout):
     commit_whitewater(layout, 3, commit(layout, 3), not_made=11)
     damaged = commit_whitewater(layout, 4, commit(layout, 4))

@@ -18,6 +18,7 @@ import websockets.asyncio.server
 from browser import until
 from click.testing import Result
 from command_line import pipeline
+from probes import probe
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 from viser import _messages
@@ -100,6 +101,14 @@ def test_a_message_that_cannot_be_read_costs_a_line(server, message, caplog, cap
     assert "Traceback" not in capfd.readouterr().err
     with joined(server, origin=None) as page:
         assert page.recv(timeout=20)
+
+
+def test_a_scan_of_ports_costs_no_traceback_and_the_page_goes_on(server, caplog, capfd):
+    probe(server.get_port())
+    with joined(server, origin=None) as page:
+        assert page.recv(timeout=20)
+    assert [record.getMessage() for record in caplog.records if record.exc_info] == []
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_what_is_done_in_its_loop_is_done_there_and_its_error_comes_back(server):

@@ -15,6 +15,7 @@ import pytest
 from dashboards import Client, dashboard, draw_frame, frame_job
 from farm_processes import Farm, wait_until
 from PIL import Image
+from probes import probe
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import live_holder
@@ -332,6 +333,15 @@ def test_answers_carry_a_policy_and_pages_name_no_other_place(farm: Farm) -> Non
         assert {"default-src 'none'", "img-src data:", "media-src data:", "sandbox allow-scripts"} <= set(policy)
         for name in ("page.js", "morph.js", "viewer.js", "page.css"):
             assert "://" not in client.ask(f"/static/{name}").text
+
+
+def test_a_scan_of_ports_costs_no_traceback_and_the_dashboard_goes_on(farm: Farm) -> None:
+    with dashboard(farm) as (client, process):
+        probe(int(client.place.partition(":")[2]))
+        assert client.ask("/").status == 200
+        process.terminate()
+        said, complaints = process.communicate(timeout=60)
+    assert "Traceback" not in said + (complaints or "")
 
 
 def test_nothing_outside_of_the_farm_is_served(farm: Farm) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import av
 import numpy as np
 import pytest
@@ -12,8 +14,10 @@ from farm_processes import Farm, wait_until
 from numbered_frames import commit, submitted
 from playwright.sync_api import Page
 
+from pipeline.base.task import FailureKind, TaskState
 from pipeline.queue.job_queue import Desired, new_entry
 from pipeline.record.manifest import Manifest
+from pipeline.run.events import JobOutcome
 from pipeline.show.report.film import as_address
 from pipeline.show.report.page import write_report
 
@@ -90,6 +94,33 @@ def test_the_film_in_a_report_is_let_through(farm: Farm) -> None:
         assert page.evaluate(
             "[document.querySelector('video').videoWidth, !document.querySelector('video').error]"
         ) == [64, True]
+
+
+def test_what_a_failed_run_left_of_an_earlier_one_is_marked_and_times_have_dates(farm: Farm) -> None:
+    layout = farm.layout("film")
+    tasks = frame_job(layout, 3)
+    with Manifest(layout.manifest) as manifest:
+        for task in tasks:
+            draw_frame(layout, manifest, task)
+        manifest.begin_run("film", run="again")
+        manifest.record_plan(tasks)
+        manifest.set_states({task.id: TaskState.PENDING for task in tasks})
+        draw_frame(layout, manifest, tasks[0])
+        number = manifest.start_attempt(tasks[1].id)
+        manifest.finish_attempt(tasks[1].id, number, failure=FailureKind.FAILED, message="no", state=TaskState.FAILED)
+        manifest.end_run(JobOutcome.FAILED)
+    with dashboard(farm) as (client, _), open_page() as page:
+        page.goto(f"http://{client.place}/jobs/film")
+        until(page, "document.querySelectorAll('.grid a').length === 3")
+        labels = page.evaluate("[...document.querySelectorAll('.grid a')].map(each => each.innerText)")
+        assert labels == ["0", "2 · old", "1 · old"]
+        ended = [text for text in page.locator(".tasks td:nth-child(5)").all_inner_texts() if text != "–"]
+        assert ended and all(re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", text) for text in ended)
+        assert page.get_by_text("of an earlier run").count() == 0  # the newest frame is of this one
+        with Manifest(layout.manifest) as manifest:
+            manifest.set_states({tasks[0].id: TaskState.PENDING})
+        page.goto(f"http://{client.place}/")
+        page.get_by_text("of an earlier run").wait_for(timeout=PATIENCE_MS)
 
 
 def test_a_report_draws_its_charts_and_runs_no_script_of_others(farm: Farm) -> None:

@@ -18,7 +18,8 @@ from dashboards import draw_frame, frame_job
 from pipeline.base.errors import ManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import LeaseHolder
-from pipeline.base.task import FailureKind, TaskId, TaskState
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import FailureKind, Task, TaskId, TaskState
 from pipeline.queue.job_queue import JobQueue
 from pipeline.queue.states import JobState
 from pipeline.record.glance import glance
@@ -114,11 +115,34 @@ def test_the_newest_frames_come_first_and_only_those_right_in_the_folder(layout:
         for k in (1, 3, 0):
             draw_frame(layout, manifest, tasks[k])
         found = manifest.newest_in("frames", ".png", limit=2)
-        assert [path for path, _ in found] == ["frames/000000.png", "frames/000003.png"]
+        assert [file.path for file in found] == ["frames/000000.png", "frames/000003.png"]
         assert manifest.newest_and_count_in("frames", ".png") == (found[0], 3)
         assert (
             manifest.newest_and_count_in("frame", ".png") == manifest.newest_and_count_in("frames", ".exr") == (None, 0)
         )
+
+
+def test_files_of_an_earlier_run_are_old_until_they_are_made_anew(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 3)
+    other = Task(TaskId("simulate"), "simulate", (), (), ParameterSet.of(stage="simulate", version=1, tools={}))
+
+    def old() -> list[str]:
+        return sorted(Path(file.path).stem for file in manifest.newest_in("frames", ".png", limit=9) if file.is_old)
+
+    with Manifest(layout.manifest) as manifest:
+        for task in tasks:
+            draw_frame(layout, manifest, task)
+        assert old() == []
+        manifest.set_states({tasks[1].id: TaskState.PENDING})
+        assert old() == ["000001"]
+        assert manifest.is_old(tasks[1].outputs[0]) and not manifest.is_old(tasks[0].outputs[0])
+        manifest.record_plan([other])  # of another goal, which says nothing about frames
+        assert old() == []
+        manifest.record_plan(tasks[:2])  # the job has become shorter
+        manifest.set_states({tasks[0].id: TaskState.FAILED})
+        assert "000002" in old() and "000000" in old()
+        newest, count = manifest.newest_and_count_in("frames", ".png")
+        assert newest is not None and (newest.path, newest.is_old, count) == ("frames/000002.png", True, 3)
 
 
 def test_a_stage_s_pace_is_that_of_its_attempts_and_its_work_that_of_a_span(layout: JobLayout) -> None:
