@@ -7,7 +7,9 @@ are preview surfaces. Nothing of the set is in it: neither ground nor lamps.
 
 from __future__ import annotations
 
+import hashlib
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,9 +119,12 @@ def write_usd_scene(
     Usd.ModelAPI(world).SetKind("component")
     for drawn in spec.objects:
         prim = _add_object(stage, drawn, meshes, placements.get(drawn.name, {}), frames)
+        prim.SetDisplayName(drawn.name)
         _paint(stage, prim, drawn.name, preview_of(drawn.material))
     for name, material in guides.items():
-        _paint(stage, _define_points(stage, name, is_guide=True).GetPrim(), name, preview_of(material))
+        prim = _define_points(stage, name, is_guide=True).GetPrim()
+        prim.SetDisplayName(name)
+        _paint(stage, prim, name, preview_of(material))
     _add_camera(stage, spec, views)
 
     with read_as(first_layer, ".usdc") as named:
@@ -187,8 +192,13 @@ def _save(layer: Any, path: Path, suffix: str) -> None:
 
 
 def prim_name(name: str) -> str:
-    """Name of the prim of an object: letters, digits and `_`."""
-    return re.sub(r"\W", "_", name, flags=re.ASCII)
+    """Name of the prim of an object: ASCII letters, digits and `_`, as all readers take them.
+
+    Others are left out, and the end of a digest tells such names apart; `displayName` has them whole.
+    """
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    end = "" if name.isascii() else f"_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return re.sub(r"\W", "_", plain, flags=re.ASCII) + end
 
 
 def _place_of(name: str) -> str:

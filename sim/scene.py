@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Any, Self
 
 from pydantic import Field, model_validator
 
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
-from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3
+from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
 from sim.fluid.parameters import FluidParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
@@ -30,6 +30,11 @@ class SceneParameters(Parameters):
     device: Device = Field(
         default="auto", description="Where the simulation runs; auto: the fastest device that works."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_composed_names(cls, document: Any) -> Any:
+        return composed(document)
 
     @model_validator(mode="after")
     def _has_reactions(self) -> Self:

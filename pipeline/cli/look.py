@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -201,6 +202,7 @@ def explain(
     pipeline explain my-film render/000012 --log --attempt 1
     """
     layout = find_job(job, output)
+    task = None if task is None else unicodedata.normalize("NFC", task)  # as names of bodies are
     if log:
         if as_json:
             raise click.UsageError("a log is text; leave --json out")

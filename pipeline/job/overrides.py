@@ -4,6 +4,7 @@ Changes go into the TOML text itself, so the copy in the job's folder keeps the 
 """
 
 import tomllib
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ from tomlkit.exceptions import TOMLKitError
 from pipeline.job import schema
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import format_path, suggestion
+from sim.core.parameters import composed
 
 INSTEAD = {"frames": "duration", "duration": "frames"}
 """Keys of which a job has one: what sets one takes the other away."""
@@ -40,7 +42,7 @@ def parse_override(argument: str, document: Mapping[str, Any]) -> Override:
     Raises OverrideError: no `=`, a path that no job has, an element that this job does not have.
     """
     written_path, equals, written_value = argument.partition("=")
-    written_path = written_path.strip()
+    written_path = unicodedata.normalize("NFC", written_path.strip())
     if not equals or not written_path:
         raise OverrideError(f"--set {argument}: expected path.to.key=value")
     path, node = _resolve(written_path, document)
@@ -84,14 +86,20 @@ def without_key(text: str, key: str) -> str:
 def _put(document: Any, override: Override) -> None:
     table = document
     for part in override.path[:-1]:
-        if isinstance(part, str) and part not in table:
+        if isinstance(part, str) and _written(table, part) not in table:
             table[part] = tomlkit.table()
         if isinstance(part, int) and part >= len(table):
             raise OverrideError(f"{override.origin}: {format_path(override.path)} is not there once the list is set")
-        table = table[part]
+        table = table[_written(table, part)]
         if not isinstance(table, Mapping | Sequence) or isinstance(table, str):
             raise OverrideError(f"{override.origin}: {format_path((part,))} is not a table in the job file")
     table[override.path[-1]] = override.value
+
+
+def _written(table: Any, part: str | int) -> Any:
+    """A key as the file has it, maybe with letters that are not composed."""
+    keys = table if isinstance(part, str) and isinstance(table, Mapping) else ()
+    return next((key for key in keys if unicodedata.normalize("NFC", key) == part), part)
 
 
 def _parse_value(written: str) -> Any:
@@ -125,7 +133,7 @@ def _unknown_key(written_path: str, word: str, path: KeyPath, node: schema.Schem
 def _element(word: str, document: object, path: KeyPath, written_path: str) -> int:
     """The index that a word stands for in the array at `path`."""
     elements = document if isinstance(document, list) else []
-    names = [each["name"] if isinstance(each, Mapping) and "name" in each else None for each in elements]
+    names = [composed(each["name"]) if isinstance(each, Mapping) and "name" in each else None for each in elements]
     if word in names:
         return names.index(word)
     if word.isdecimal() and int(word) < len(elements):

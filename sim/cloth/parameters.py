@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from sim.cloth.materials import MATERIALS, Material
-from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import MeshShape
 
 Corner = Literal["x-y-", "x+y-", "x-y+", "x+y+"]
@@ -160,7 +160,7 @@ class ClothParameters(Parameters):
     change them. `sim.cloth.springs` converts them.
     """
 
-    name: str = Field(description="Name of the cloth, unique in the job.", pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
+    name: BodyName = Field(description="Name of the cloth, unique in the job.")
     shape: Sheet = Field(description="The sheet without loads: a rectangle, or any triangle mesh.")
     position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="World position of the sheet's centre [m].")
     rotation_deg: Vector3 = Field(

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
 from sim.fluid.traits import CFL_NUMBER, TRAITS, VISCOUS_NUMBER
 from sim.shapes.parameters import Placement
 
@@ -67,7 +67,7 @@ class EmitterParameters(Parameters):
 class FluidParameters(Parameters):
     """A fluid: its material, its discretization, the volumes it fills at the start and where more flows in."""
 
-    name: str = Field(description="Name of the fluid, unique in the job.", pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
+    name: BodyName = Field(description="Name of the fluid, unique in the job.")
     solver: Literal["wcsph", "dfsph", "pcisph"] = Field(
         default="wcsph",
         description="wcsph: weakly compressible SPH (Becker & Teschner 2007); dfsph: divergence-free SPH (Bender & "

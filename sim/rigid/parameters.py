@@ -7,14 +7,14 @@ from typing import Any, Literal, Self
 from pydantic import Field, model_validator
 
 from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
-from sim.core.parameters import Fraction, NonNegative, Vector3
+from sim.core.parameters import BodyName, Fraction, NonNegative, Vector3
 from sim.shapes.parameters import WeightedPlacement
 
 
 class RigidBodyParameters(WeightedPlacement):
     """A rigid body: fixed, moved along a path, or moved by forces and contacts."""
 
-    name: str = Field(description="Name of the body, unique in the job.", pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
+    name: BodyName = Field(description="Name of the body, unique in the job.")
     kind: Literal["static", "kinematic", "dynamic"] = Field(
         default="static",
         description="static: never moves; kinematic: follows its keyframes, or its constant velocities, whatever it "

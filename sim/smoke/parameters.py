@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from sim.core.domain import DomainParameters, Face, Faces
 from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
-from sim.core.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
 
 WHOLE = 1.0e-6  # part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001
@@ -132,7 +132,7 @@ class TurbulenceParameters(Parameters):
 class SmokeParameters(Parameters):
     """Hot smoke in a box of cells: its sources, its physics and its numerics."""
 
-    name: str = Field(description="Name of the smoke, unique in the job.", pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
+    name: BodyName = Field(description="Name of the smoke, unique in the job.")
     source: tuple[SmokeSourceParameters, ...] = Field(min_length=1, description="Where the smoke comes from.")
     min: Vector3 | None = Field(default=None, description="Lower corner of its grid [m]; the domain's if omitted.")
     max: Vector3 | None = Field(default=None, description="Upper corner of its grid [m]; the domain's if omitted.")
