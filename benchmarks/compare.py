@@ -161,9 +161,9 @@ def film(tree: Path, job: str) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         (root / "film.toml").write_text(job, encoding="utf-8")
-        numbers = {"film_s": pipeline(tree, "submit", "film.toml", "--output", ".", "--executor", "inline", cwd=root)}
+        numbers = {"film_s": pipeline(tree, "submit", "film.toml", "--executor", "inline", cwd=root)}
         seconds: dict[str, list[float]] = {}
-        with closing(sqlite3.connect(root / "film" / "manifest.db")) as record:
+        with closing(sqlite3.connect(root / "renders" / "film" / "manifest.db")) as record:
             for stage, spent in record.execute(
                 "SELECT stage, seconds FROM attempt JOIN task ON task.id = attempt.task"
             ):

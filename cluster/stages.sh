@@ -1,7 +1,7 @@
 #!/bin/bash
 # A job's stages as SLURM jobs: arrays over chunks of frames, each of which begins when those that it reads are done.
 #
-#     pipeline export openjd job.toml --output /shared/renders --set device=cpu --set render.device=cpu
+#     pipeline export job.toml --to openjd --farm /shared/renders --set device=cpu --set render.device=cpu
 #     cluster/stages.sh /shared/renders/my-film --partition=cpu      # options of sbatch for all stages
 #     pipeline resume /shared/renders/my-film                        # when all are done: takes them into the record
 #

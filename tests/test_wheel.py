@@ -63,7 +63,7 @@ def test_wheel_makes_a_film_from_another_folder(wheel, tmp_path):
         "render.resolution=[64,36]",
         "render.quality=draft",
     )
-    printed(pipeline, "submit", "tiny", *chain(*(("--set", change) for change in changes)), "--output", ".", cwd=folder)
+    printed(pipeline, "submit", "tiny", *chain(*(("--set", change) for change in changes)), "--farm", ".", cwd=folder)
     film = folder / "tiny"
     assert (film / "movie.mp4").stat().st_size > 0
     assert len(list((film / "frames").glob("*.png"))) == 3

@@ -36,7 +36,8 @@ cores_option = click.option(
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 output_option = click.option(
-    "--output",
+    "--farm",
+    "output",
     type=click.Path(path_type=Path, file_okay=False),
     default=DEFAULT_OUTPUT,
     show_default=True,
@@ -58,7 +59,7 @@ class JobFilePath(click.ParamType):  # type: ignore[type-arg]
     name = "job file"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:  # noqa: ARG002
-        """The job file's path; --output has been read before."""
+        """The job file's path; --farm has been read before."""
         output = DEFAULT_OUTPUT if ctx is None else ctx.params.get("output", DEFAULT_OUTPUT)
         return value if isinstance(value, Path) else find_job_file(value, output)
 
@@ -106,7 +107,7 @@ def submitted_job_argument(command: Any) -> Any:
 def target_option(meaning: str, *, required: bool = False) -> Callable[[Any], Any]:
     """Where to write a file."""
     path = click.Path(path_type=Path, dir_okay=False)
-    return click.option("-o", "--to", "target", type=path, required=required, help=f"Where to write it{meaning}.")
+    return click.option("-o", "--output", "target", type=path, required=required, help=f"Where to write it{meaning}.")
 
 
 def submission_folder(job_file: Path, name: str, output: Path, *, is_changed: bool) -> JobLayout:

@@ -155,7 +155,7 @@ def work(
 
     \b
     pipeline work
-    pipeline work --output /data/renders
+    pipeline work --farm /data/renders
     pipeline work my-film --stage render --frames 0-9
     """
     if job is not None:

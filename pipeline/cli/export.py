@@ -38,6 +38,7 @@ OPENJD = "openjd"
 )
 @click.option(
     "-o",
+    "--output",
     "target",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
@@ -80,7 +81,7 @@ def export(
     pipeline export my-film --to blend --frames 10-40 -o ~/for-anna
     pipeline export my-film --to gltf --frames 0-239x4
     pipeline export dam.toml --to vtk --set fluid.water.particle_radius=0.01
-    pipeline export dam.toml --to openjd --output /shared/renders
+    pipeline export dam.toml --to openjd --farm /shared/renders
     """
     if wanted == OPENJD:
         if frames is not None or target is not None:

@@ -134,7 +134,7 @@ def doctor(output: Path, as_json: bool) -> None:
 
     \b
     pipeline doctor
-    pipeline doctor --output /data/renders --json
+    pipeline doctor --farm /data/renders --json
     """
     from pipeline.show.doctor import examine, print_report
 

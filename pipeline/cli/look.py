@@ -65,7 +65,7 @@ def status(job: str | None, output: Path, as_json: bool, follow: bool) -> None:
 
     \b
     pipeline status
-    pipeline status --output /data/renders --json
+    pipeline status --farm /data/renders --json
     pipeline status my-film
     pipeline status my-film --follow
     """
@@ -103,7 +103,7 @@ def _list_jobs(output: Path, *, as_json: bool) -> None:
     if holder is not None:
         click.echo(f"run by process {holder.pid} on {holder.host} since {wording.moment(holder.acquired)}")
     elif queue.waiting():
-        click.echo(f"nobody runs the queue; run it with: pipeline work --output {output}")
+        click.echo(f"nobody runs the queue; run it with: pipeline work --farm {output}")
 
 
 def _follow(job: str, output: Path) -> int:
@@ -116,7 +116,7 @@ def _follow(job: str, output: Path) -> int:
         return watch(find_job(job, output))
     code = Follower(queue, as_given(queue.layout(name)), submission=entry.submission).follow()
     if code is None:
-        raise PipelineError(f"{name} waits, and nobody runs the queue; run it with: pipeline work --output {output}")
+        raise PipelineError(f"{name} waits, and nobody runs the queue; run it with: pipeline work --farm {output}")
     return code
 
 
@@ -175,7 +175,7 @@ def _show_job(job: str, output: Path, *, as_json: bool) -> None:
     if len(failures) > 10:
         click.echo(f"  ... and {len(failures) - 10} more")
     if state == "queued" and live_holder(queue.lease) is None:
-        click.echo(f"nobody runs the queue; run it with: pipeline work --output {output}")
+        click.echo(f"nobody runs the queue; run it with: pipeline work --farm {output}")
 
 
 @click.command()

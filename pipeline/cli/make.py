@@ -167,7 +167,7 @@ def submit(
     pipeline submit dam.toml --until surface
     pipeline submit dam.toml --set render.quality=final --set camera.f_stop=2.8
     pipeline submit dam.toml --detach --priority 10
-    pipeline submit dam.toml --output /shared/renders --scheduler tcp://farm:8786
+    pipeline submit dam.toml --farm /shared/renders --scheduler tcp://farm:8786
     """
     from pipeline.record.interrupted_recording import complete_interrupted_recording
     from pipeline.run.checked_job import read_own_job

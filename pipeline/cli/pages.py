@@ -168,7 +168,7 @@ def dashboard(output: Path, host: str, port: int, token_file: Path | None) -> No
 
     \b
     pipeline dashboard
-    pipeline dashboard --output /data/renders --port 0
+    pipeline dashboard --farm /data/renders --port 0
     pipeline dashboard --host studio-3 --token-file ~/.farm-token
     ssh -L 8790:127.0.0.1:8790 studio-3      from elsewhere, without another address and without a token
     """
@@ -178,7 +178,7 @@ def dashboard(output: Path, host: str, port: int, token_file: Path | None) -> No
     from pipeline.web.serving import listen, remark_of, serve, url
 
     if not output.is_dir():
-        raise PipelineError(f"there is no folder {output}; name the one that holds the jobs' folders with --output")
+        raise PipelineError(f"there is no folder {output}; name the one that holds the jobs' folders with --farm")
     listening = listen(host, port)
     port = listening.getsockname()[1]
     access = access_of(host, port, token_file)

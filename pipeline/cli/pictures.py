@@ -75,7 +75,7 @@ def still(
     pipeline still my-film --frame 90 --resolution 3840 2160 -o poster.png
     pipeline still my-film --frame 90 --quality preview --set 'camera.position=[0, -3, 1]'
     pipeline still my-film --sheet
-    pipeline still my-film --sheet --pictures 30 --columns 6 --to my-film.webp
+    pipeline still my-film --sheet --pictures 30 --columns 6 -o my-film.webp
     """
     if sheet == (frame is not None):
         raise click.UsageError("say what to draw: one frame with --frame, or many on one picture with --sheet")
@@ -272,13 +272,13 @@ def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
 
     \b
     pipeline report my-film
-    pipeline report bunny-wcsph bunny-dfsph --to energy.html
+    pipeline report bunny-wcsph bunny-dfsph -o energy.html
     """
     from pipeline.show.report.page import write_report
 
     layouts = [find_job(job, output) for job in jobs]
     if target is None and len(layouts) > 1:
-        raise click.UsageError("say where to write the comparison: --to comparison.html")
+        raise click.UsageError("say where to write the comparison: -o comparison.html")
     path = layouts[0].report if target is None else target
     try:
         write_report(layouts, path)

@@ -301,7 +301,7 @@ def start_in_background(queue: JobQueue) -> int | None:
         search_path = os.pathsep.join([os.fspath(here), *filter(None, [os.environ.get("PYTHONPATH")])])
         with queue.log.open("wb" if fresh else "ab") as log:
             child = subprocess.Popen(
-                [*COMMAND, "work", "--output", os.fspath(queue.farm.resolve())],
+                [*COMMAND, "work", "--farm", os.fspath(queue.farm.resolve())],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

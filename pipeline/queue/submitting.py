@@ -275,5 +275,5 @@ def make_folder(layout: JobLayout) -> None:
         if is_disk_full(error):
             raise DiskFullError.of(layout.root) from error
         raise PipelineError(
-            f"cannot write to {layout.root}: {error.strerror}; name another folder with --output"
+            f"cannot write to {layout.root}: {error.strerror}; name another folder with --farm"
         ) from error

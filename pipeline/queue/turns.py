@@ -42,7 +42,7 @@ def stand_in_queue(queue: JobQueue, layout: JobLayout, entry: QueuedJob, *, deta
         pid = start_in_background(queue)
         how = "runs in the background" if pid is None else f"runs in the background, process {pid}"
         click.echo(f"{entry.name} is queued; the queue {how}")
-        click.echo(f"see: pipeline status --output {queue.farm}; pipeline status {layout.root} --follow")
+        click.echo(f"see: pipeline status --farm {queue.farm}; pipeline status {layout.root} --follow")
         return 0
     while True:
         try:

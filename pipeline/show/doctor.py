@@ -197,12 +197,12 @@ def _examine_output(output: Path) -> Iterable[Examination]:
             file.flush()
     except OSError as error:
         found = f"{folder} cannot be written: {error.strerror}"
-        yield Examination("output folder", "failed", found, "choose another with --output")
+        yield Examination("output folder", "failed", found, "choose another with --farm")
         return
     free = shutil.disk_usage(folder).free
     found = f"{folder}: writable, {free / 1e9:.1f} GB free"
     if free < LITTLE_DISK_BYTES:
-        yield Examination("output folder", "warning", found, "free some space, or choose another with --output")
+        yield Examination("output folder", "warning", found, "free some space, or choose another with --farm")
     else:
         yield Examination("output folder", "ok", found)
 

@@ -218,7 +218,7 @@ def test_a_disk_that_fills_after_the_simulation_loses_nothing(finished: Studio, 
 @pytest.mark.parametrize("place", ["a file", "a file/films", "/proc/films"])
 def test_a_place_that_cannot_be_written_to_is_refused_in_one_line(empty: Studio, place: str) -> None:
     (empty.folder / "a file").write_text("mine")
-    refused = empty.run("submit", "tiny.toml", "--output", place)
+    refused = empty.run("submit", "tiny.toml", "--farm", place)
     assert refused.code in (1, 2)
     assert refused.out == ""
     [line] = [line for line in refused.err.splitlines() if line.startswith(("error: ", "Error: "))]

@@ -86,7 +86,7 @@ class Client:
 def dashboard(farm: Farm, *options: str, folder: str = "renders") -> Iterator[tuple[Client, subprocess.Popen[str]]]:
     """`pipeline dashboard` of a farm of synthetic jobs, on a free port."""
     (farm.folder / folder).mkdir(exist_ok=True)
-    process = farm.start("dashboard", "--port", "0", "--output", folder, *options)
+    process = farm.start("dashboard", "--port", "0", "--farm", folder, *options)
     assert process.stdout is not None
     address = process.stdout.readline().strip()
     assert address.startswith("http://"), process.communicate(timeout=30)

@@ -56,7 +56,7 @@ def loaded(folder: Path, text: str = BALL_OVER_SHEET) -> LoadedJob:
 
 def live(folder: Path, *options: object) -> Result:
     """What `pipeline live` of the ball over a sheet printed, and its exit code."""
-    return pipeline("live", loaded(folder).path, "--port", 0, "--output", folder, *options)
+    return pipeline("live", loaded(folder).path, "--port", 0, "--farm", folder, *options)
 
 
 def session_of(folder: Path, text: str = BALL_OVER_SHEET) -> Session:

@@ -74,7 +74,7 @@ def _live(folder: Path, printed: Path) -> tuple[subprocess.Popen[bytes], str]:
     """A session in a process of its own, and its address."""
     job = folder / "drape.toml"
     job.write_text(BALL_OVER_SHEET)
-    command = [sys.executable, "-P", "-m", "pipeline", "live", str(job), "--port", "0", "--output", str(folder)]
+    command = [sys.executable, "-P", "-m", "pipeline", "live", str(job), "--port", "0", "--farm", str(folder)]
     with printed.open("wb") as log:
         process = subprocess.Popen(command, cwd=PROJECT, stdout=log, stderr=log)
     while (found := re.search(r"http://(\S+:\d+)/ runs", printed.read_text())) is None:

@@ -76,7 +76,7 @@ def test_two_gpus_have_a_renderer_each_one_compiles_and_each_frame_says_what_dre
     for seed, device in enumerate(("auto", "gpu")):  # what was simulated for the first is drawn anew for the second
         keys = {"blender": blender, "device": device, "seed": seed}
         options = [word for key, value in keys.items() for word in ("--set", f"render.{key}={value}")]
-        result = pipeline("submit", tmp_path / "ball.toml", "--output", tmp_path / "renders", *options)
+        result = pipeline("submit", tmp_path / "ball.toml", "--farm", tmp_path / "renders", *options)
         assert result.exit_code == 0, result.stderr
         assert result.stderr.count(f"render: compiling Cycles' kernels for {CARD}; minutes, once") == 1
         assert kernels_marker(f"OPTIX: {CARD}", "5.0.1").exists()

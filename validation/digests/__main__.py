@@ -39,7 +39,7 @@ def digest_job(job: Path, output: Path, frames: int) -> Iterator[tuple[str, str]
     Raises:
         subprocess.CalledProcessError: the job failed.
     """
-    command = [sys.executable, "-P", "-m", "pipeline", "submit", str(job), "--output", str(output)]
+    command = [sys.executable, "-P", "-m", "pipeline", "submit", str(job), "--farm", str(output)]
     subprocess.run([*command, "--set", f"frames={frames}"], check=True, stdout=sys.stderr)
     folder = output / job.stem
     for path in outputs(folder):

@@ -31,6 +31,17 @@ def test_help_of_every_command_shows_an_example():
         assert f"pipeline {name}" in result.stdout.split("Options:")[0].partition("\n")[2], name
 
 
+def test_options_of_where_and_how_mean_the_same_in_every_command():
+    places = {
+        (flag, option.name)
+        for command in main.commands.values()
+        for option in command.params
+        for flag in option.opts
+        if flag in ("-o", "--output", "--to", "--farm") or option.name in ("target", "output")
+    }
+    assert places == {("-o", "target"), ("--output", "target"), ("--to", "wanted"), ("--farm", "output")}
+
+
 def test_new_writes_a_file_that_check_accepts(in_tmp_path):
     result = pipeline("new", "films/my-film", "--template", "smoke")
     assert result.exit_code == 0
@@ -154,6 +165,6 @@ def test_the_shell_completes_names_of_jobs(command, tmp_path):
         JobLayout(tmp_path / name).root.mkdir()
         JobLayout(tmp_path / name).manifest.touch()
     (tmp_path / "drop-c").mkdir()  # no job
-    arguments = [command, "--output", str(tmp_path)]
+    arguments = [command, "--farm", str(tmp_path)]
     found = ShellComplete(main, {}, "pipeline", "").get_completions(arguments, "drop")
     assert [each.value for each in found if each.type == "plain"] == ["drop-a", "drop-b"]

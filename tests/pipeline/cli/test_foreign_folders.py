@@ -25,16 +25,16 @@ OF_QUEUE = {"pause", "cancel", "priority"}
 """Commands that only change the job's entry in the queue, which lies beside its folder."""
 
 WRITERS = {
-    "submit": [["{file}", "--output", "{farm}"], ["{job}/job.toml"]],
-    "sweep": [["{file}", "--output", "{farm}", "--set", "frames=1,2"]],
+    "submit": [["{file}", "--farm", "{farm}"], ["{job}/job.toml"]],
+    "sweep": [["{file}", "--farm", "{farm}", "--set", "frames=1,2"]],
     "rerun": [["{job}", "--failed"], ["{job}", "--stage", "render"]],
     "resume": [["{job}"]],
     "work": [["{job}", "--stage", "simulate"], ["{job}", "--stage", "render"]],
-    "export": [["{file}", "--to", "openjd", "--output", "{farm}", "--set", "device=cpu", "--set", "render.device=cpu"]],
+    "export": [["{file}", "--to", "openjd", "--farm", "{farm}", "--set", "device=cpu", "--set", "render.device=cpu"]],
     "still": [["{job}", "--frame", "0"], ["{job}", "--sheet"]],
     "animatic": [["{job}"]],
-    "compare": [["{job}", "{job}", "--to", "{farm}/pair.mp4"]],
-    "loop": [["{job}", "--to", "{farm}/loop.webp"]],
+    "compare": [["{job}", "{job}", "-o", "{farm}/pair.mp4"]],
+    "loop": [["{job}", "-o", "{farm}/loop.webp"]],
     "report": [["{job}"]],
     "verify": [["{job}"], ["{job}", "--deep"], ["{job}", "--rebuild"]],
     "clean": [
@@ -67,7 +67,7 @@ def finished(tmp_path: Path, drawing: None) -> Path:
     file = tmp_path / "finished" / "synthetic.toml"
     file.parent.mkdir()
     file.write_text(job_text(frames=2))
-    ended = pipeline("submit", file, "--output", file.parent, "--executor", "inline")
+    ended = pipeline("submit", file, "--farm", file.parent, "--executor", "inline")
     assert ended.exit_code == 0, ended.output
     return file.with_suffix("")
 

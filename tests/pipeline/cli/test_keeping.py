@@ -30,7 +30,7 @@ def test_a_record_with_damaged_pages_is_told_with_a_remedy_that_works(layout: Jo
     content = bytearray(layout.manifest.read_bytes())
     content[4096:] = b"\xa5" * (len(content) - 4096)
     layout.manifest.write_bytes(content)
-    of_file = [layout.job_file, "--output", layout.root.parent]
+    of_file = [layout.job_file, "--farm", layout.root.parent]
     of_folder = {"status": [layout.root], "explain": [layout.root, "simulate"]}
     refused = pipeline(command, *of_folder.get(command, of_file))
     assert (refused.exit_code, refused.stdout) == (1, "")
@@ -108,13 +108,13 @@ def test_pipes_in_the_place_of_files_hold_up_no_status(layout: JobLayout) -> Non
         receipt.unlink()
         os.mkfifo(receipt)
     assert pipeline("status", layout.root).exit_code == 0
-    assert pipeline("status", "--output", layout.root.parent).exit_code == 0
+    assert pipeline("status", "--farm", layout.root.parent).exit_code == 0
     for path in (layout.manifest, layout.goal, layout.lease):
         path.unlink(missing_ok=True)
         os.mkfifo(path)
         told = pipeline("status", layout.root)
         assert (told.exit_code, f"{path} is no file" in told.stderr) == (1, True)
-        listed = pipeline("status", "--output", layout.root.parent)
+        listed = pipeline("status", "--farm", layout.root.parent)
         assert f"{path} is no file" in listed.output
 
 

@@ -182,7 +182,7 @@ def written(folder: Path, frames: int = FRAMES) -> Path:
 
 def submit(folder: Path, frames: int = FRAMES) -> JobLayout:
     """Run the command line in a process of its own, which learns of the kind from this module."""
-    arguments = ["submit", str(written(folder, frames)), "--output", str(folder / "renders"), "--executor", "inline"]
+    arguments = ["submit", str(written(folder, frames)), "--farm", str(folder / "renders"), "--executor", "inline"]
     script = (
         "from test_fifth_kind import GRAIN, table\n"
         "from pipeline.cli.main import main\n"

@@ -219,7 +219,7 @@ def test_check_and_plan_tell_the_cost(tmp_path, monkeypatch):
     result = pipeline("check", tmp_path / "drop.toml", "--until", "simulate")
     assert "of disk" in result.output
     assert "of memory" in result.output
-    result = pipeline("plan", tmp_path / "drop.toml", "--until", "simulate", "--output", tmp_path)
+    result = pipeline("plan", tmp_path / "drop.toml", "--until", "simulate", "--farm", tmp_path)
     assert "simulate: about" in result.output
 
 

@@ -243,7 +243,7 @@ def test_what_another_host_queues_while_the_runner_gives_its_lease_back_is_run(q
     monkeypatch.setattr(Turns, "run", run)
     monkeypatch.setattr(Lease, "release", release_late)
     queue.put(new_entry("a", text="x"))
-    told = pipeline("work", "--output", queue.farm)
+    told = pipeline("work", "--farm", queue.farm)
     assert (told.exit_code, turns) == (0, ["a", "b"])
     assert "the queue is empty" in told.stderr
 

@@ -172,7 +172,7 @@ def test_a_farm_that_cannot_be_written_to_is_told(queue, monkeypatch):
 
 @pytest.mark.parametrize("command", ["pause", "cancel"])
 def test_a_folder_that_is_none_is_not_made_by_a_command_about_a_job(tmp_path, command):
-    told = pipeline(command, "film", "--output", tmp_path / "typo")
+    told = pipeline(command, "film", "--farm", tmp_path / "typo")
     assert (told.exit_code, '"film" is not in the queue' in told.stderr) == (1, True)
     assert list(tmp_path.iterdir()) == []
 
@@ -182,7 +182,7 @@ def test_a_damaged_record_of_one_job_hides_no_other_from_the_list(queue):
     queue.put(new_entry("bad"))
     queue.layout("bad").root.mkdir()
     queue.layout("bad").manifest.write_bytes(b"garbage" * 2000)
-    told = pipeline("status", "--output", queue.farm, "--json")
+    told = pipeline("status", "--farm", queue.farm, "--json")
     listed = json.loads(told.stdout)
     assert [job["name"] for job in listed["jobs"]] == ["good", "bad"]
     assert len(listed["flaws"]) == 1

@@ -57,7 +57,7 @@ def submit(folder: Path, *arguments: str, **told: float) -> tuple[Result, JobLay
     layout = JobLayout(folder / "renders" / "job")
     layout.root.mkdir(parents=True, exist_ok=True)
     (layout.root / "drawing.json").write_text(json.dumps(told))
-    result = pipeline("submit", folder / "job.toml", "--output", folder / "renders", "--executor", "inline", *arguments)
+    result = pipeline("submit", folder / "job.toml", "--farm", folder / "renders", "--executor", "inline", *arguments)
     return result, layout
 
 

@@ -196,7 +196,7 @@ samples = 1
 """
     )
     result = pipeline(
-        "sweep", job, "--set", "camera.position=[0,-1.5,0.5],[1.1,-1.1,0.8]", "--output", tmp_path / "renders"
+        "sweep", job, "--set", "camera.position=[0,-1.5,0.5],[1.1,-1.1,0.8]", "--farm", tmp_path / "renders"
     )
     assert result.exit_code == 0, result.output
     with Image.open(tmp_path / "renders" / "drop-sweep.png") as sheet:

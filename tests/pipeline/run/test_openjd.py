@@ -184,12 +184,12 @@ def test_every_try_has_a_number_of_its_own_also_beside_others(synthetic):
 @pytest.mark.slow
 def test_a_job_run_by_the_reference_runtime_has_the_same_frames(tmp_path):
     (tmp_path / "small.toml").write_text(JOB)
-    pipeline("export", tmp_path / "small.toml", "--to", "openjd", "--output", tmp_path / "farm", *CPU)
+    pipeline("export", tmp_path / "small.toml", "--to", "openjd", "--farm", tmp_path / "farm", *CPU)
     template = tmp_path / "farm" / "small" / "openjd.json"
     run(OPENJD, "check", template)
     told = run(OPENJD, "run", template, "--step", "movie", "--run-dependencies", "--job-param", "ChunkFrames=2")
     assert "openjd_progress: 100.0" in told
-    pipeline("submit", tmp_path / "small.toml", "--output", tmp_path / "here", *CPU)
+    pipeline("submit", tmp_path / "small.toml", "--farm", tmp_path / "here", *CPU)
     here, farm = (sorted((tmp_path / name / "small" / "frames").iterdir()) for name in ("here", "farm"))
     assert len(farm) == 3
     assert [path.read_bytes() for path in farm] == [path.read_bytes() for path in here]

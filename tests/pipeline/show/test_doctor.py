@@ -16,7 +16,7 @@ from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libra
 
 @pytest.mark.slow
 def test_this_machine_is_fit_and_the_report_is_json(tmp_path):
-    result = pipeline("doctor", "--json", "--output", tmp_path / "renders")
+    result = pipeline("doctor", "--json", "--farm", tmp_path / "renders")
     report = {each["name"]: each for each in json.loads(result.stdout)}
     assert {"Python", "shared libraries", "device cpu", "Blender", "OpenVDB", "video", "output folder"} <= set(report)
     assert report["device cpu"]["status"] == "ok"

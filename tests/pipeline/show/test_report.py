@@ -283,7 +283,7 @@ def test_jobs_in_comparison_share_their_charts(layout, tmp_path):
     other = submitted(tmp_path / "other", name="other")
     commit(other, 0, kinetic_energy=1.0, potential_energy=8.0)
     commit(other, 1, kinetic_energy=4.0, potential_energy=2.0)
-    result = pipeline("report", layout.root, other.root, "--to", tmp_path / "c.html")
+    result = pipeline("report", layout.root, other.root, "-o", tmp_path / "c.html")
     assert result.exit_code == 0, result.output
     text, page = read(tmp_path / "c.html")
     assert "<th>other</th><td>9 J</td><td>6 J</td><td>3 J</td>" in text
@@ -297,7 +297,7 @@ def test_a_comparison_must_be_told_where_to_go(layout, tmp_path):
     other = submitted(tmp_path / "other", name="other")
     result = pipeline("report", layout.root, other.root)
     assert result.exit_code == 2
-    assert "--to comparison.html" in result.output
+    assert "-o comparison.html" in result.output
 
 
 def test_a_job_without_frames_has_a_report_too(tmp_path):
@@ -309,6 +309,6 @@ def test_a_job_without_frames_has_a_report_too(tmp_path):
 
 
 def test_a_report_that_cannot_be_written_says_so(layout, tmp_path):
-    result = pipeline("report", layout.root, "--to", tmp_path / "nowhere/r.html")
+    result = pipeline("report", layout.root, "-o", tmp_path / "nowhere/r.html")
     assert result.exit_code == 1
     assert "No such file or directory" in result.output

@@ -63,7 +63,7 @@ def test_a_sheet_shows_frames_of_one_version_of_the_job_and_says_if_it_is_an_ear
 
 
 def test_a_sheet_of_an_unknown_kind_is_refused(job):
-    result = pipeline("still", "--sheet", job, "--to", job / "sheet.doc")
+    result = pipeline("still", "--sheet", job, "-o", job / "sheet.doc")
     assert result.exit_code == 1
     assert '".doc" is no kind of picture' in result.output
 

@@ -190,7 +190,7 @@ def test_a_port_that_is_taken_is_told_and_a_free_one_named(opens):
 def test_a_command_on_a_port_that_is_taken_ends_with_that_line(tmp_path):
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
-        outcome = pipeline("dashboard", "--output", tmp_path, "--port", port)
+        outcome = pipeline("dashboard", "--farm", tmp_path, "--port", port)
     assert outcome.exit_code == 1
     assert f"port {port} of 127.0.0.1 is taken" in outcome.output
 
@@ -199,7 +199,7 @@ def test_without_a_package_of_the_extra_commands_say_what_to_install(tmp_path, m
     monkeypatch.setitem(sys.modules, "viser", None)  # as Python marks what it could not import
     (tmp_path / "job").mkdir()
     (tmp_path / "job" / "job.toml").write_text(DROP)
-    for outcome in (live(tmp_path), pipeline("view", tmp_path / "job"), pipeline("dashboard", "--output", tmp_path)):
+    for outcome in (live(tmp_path), pipeline("view", tmp_path / "job"), pipeline("dashboard", "--farm", tmp_path)):
         assert outcome.exit_code == 3
         assert 'need viser: install the extra "view"' in outcome.output
 

@@ -435,7 +435,7 @@ def test_another_address_than_the_loopback_has_a_token_of_its_own(farm: Farm) ->
 
 # --- what goes wrong ---
 def test_a_folder_that_is_not_there_is_told(farm: Farm) -> None:
-    assert "there is no folder nowhere" in farm.run("dashboard", "--output", "nowhere", code=1).err
+    assert "there is no folder nowhere" in farm.run("dashboard", "--farm", "nowhere", code=1).err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
