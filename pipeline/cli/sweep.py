@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from pipeline.base import wording
-from pipeline.base.errors import JobFileError
+from pipeline.base.errors import JobFileError, PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.base.wording import print_warnings
 from pipeline.cli.arguments import (
@@ -70,8 +70,8 @@ def sweep(
 
     The jobs are named by their values, and run one after the other in the usual queue. What several of them make from
     the same, such as the simulation where only the camera differs, is made once and shared. At the end there are one
-    sheet of pictures with the values written in, NAME-sweep.png, and one table of the solvers' numbers,
-    NAME-sweep.csv, in the output folder. The same command again goes on where it stopped.
+    sheet of pictures with the values written in, NAME-KEYS-sweep.png, and one table of the solvers' numbers,
+    NAME-KEYS-sweep.csv, beside the jobs' folders. The same command again goes on where it stopped.
 
     Commas between brackets or in quotes are part of a value.
 
@@ -81,9 +81,13 @@ def sweep(
     pipeline sweep my-film --set 'camera.position=[0,-3,1],[2,-2,1]' --set render.quality=draft
     pipeline sweep dam.toml --set 'gravity=[0,0,-9.81],[0,0,-1.62]' --until simulate --dry-run
     """
-    from pipeline.job.sweep import variants
+    from pipeline.job.loading import load_job
+    from pipeline.job.sweep import sweep_name, variants
 
-    planned = _checked(job_file, variants(settings), output, preview=preview, until=until)
+    base = load_job(job_file)
+    planned = _checked(job_file, base.name, variants(settings, base), output, preview=preview, until=until)
+    name = sweep_name(base.name + ("-preview" if preview else ""), planned[0].variant)
+    _require_own(output / f"{name}.csv", planned)
     _say_cost(planned, until, options)
     if dry_run:
         return
@@ -91,18 +95,15 @@ def sweep(
     if options.detach:
         say_aside("for the sheet and the table, give the same command again without --detach")
         sys.exit(code)
-    _write_results(planned, output, _sweep_name(job_file, preview=preview))
+    _write_results(planned, output, name)
     sys.exit(code)
 
 
 def _checked(
-    job_file: Path, variants: list[Variant], output: Path, *, preview: bool, until: tuple[str, ...]
+    job_file: Path, base: str, variants: list[Variant], output: Path, *, preview: bool, until: tuple[str, ...]
 ) -> list[_Planned]:
     """Every job, checked before any runs. Raises JobFileError with the problems of all of them, each once."""
-    from pipeline.job.loading import load_job
     from pipeline.run.checked_job import checked, read_own_job, require_plannable
-
-    base = load_job(job_file).name
 
     def read(variant: Variant) -> LoadedJob:
         overrides = (*variant.overrides, f'name="{base[:39]}-{variant.suffix}"')
@@ -118,6 +119,18 @@ def _checked(
         _Planned(variant, loaded, findings, JobLayout(output / loaded.job.name))
         for variant, (loaded, findings) in zip(variants, found, strict=True)
     ]
+
+
+def _require_own(table: Path, planned: list[_Planned]) -> None:
+    """Raises PipelineError: the table of results is of a sweep with jobs that this one has not, and would be lost."""
+    from pipeline.show.sweep_results import jobs_of_table
+
+    others = jobs_of_table(table) - {each.layout.root.name for each in planned}
+    if others:
+        raise PipelineError(
+            f"{table} is of another sweep, with {', '.join(sorted(others)[:3])}{', ...' if len(others) > 3 else ''}; "
+            "give the values of those, too, or move the table and its sheet away"
+        )
 
 
 def _of_all(act: Callable[[T], Result], each: Sequence[T]) -> list[Result]:
@@ -194,15 +207,8 @@ def _write_results(planned: list[_Planned], output: Path, name: str) -> None:
     from pipeline.show.sweep_results import write_sheet, write_table
 
     made = [(each.variant, each.layout) for each in planned]
-    sheet, table = output / f"{name}-sweep.png", output / f"{name}-sweep.csv"
+    sheet, table = output / f"{name}.png", output / f"{name}.csv"
     if shown := write_sheet(made, sheet):
         click.echo(f"{sheet}: {wording.counted(shown, 'job')}")
     if lines := write_table(made, table):
         click.echo(f"{table}: {wording.counted(lines, 'line')}")
-
-
-def _sweep_name(job_file: Path, *, preview: bool) -> str:
-    """Of its sheet and its table."""
-    from pipeline.job.loading import load_job
-
-    return load_job(job_file).name + ("-preview" if preview else "")

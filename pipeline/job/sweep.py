@@ -10,6 +10,7 @@ from itertools import product
 
 from pipeline.base.errors import JobFileError
 from pipeline.base.parameter_set import digest_of
+from pipeline.model.job import Job
 
 MOST_JOBS = 1000
 """Nobody means a larger grid."""
@@ -32,8 +33,8 @@ class Variant:
         return "\n".join(f"{key} = {value}" for key, value in self.values)
 
 
-def variants(settings: Sequence[str]) -> list[Variant]:
-    """Every combination of the values in settings `path.to.key=value,value`, the last key changing fastest.
+def variants(settings: Sequence[str], job: Job) -> list[Variant]:
+    """Every combination of the values in settings `path.to.key=value,value` of a job, the last key changing fastest.
 
     Commas between brackets and in quotes are part of a value: `camera.position=[0,-2,1],[0,-3,1]` is two. A key with
     one value is the same in all jobs.
@@ -65,7 +66,7 @@ def variants(settings: Sequence[str]) -> list[Variant]:
         problems.append(f"{total:,} jobs are more than {MOST_JOBS:,}; give fewer values")
     if problems:
         raise JobFileError(problems)
-    return list(_combined(written))
+    return list(_combined(written, job))
 
 
 def split_values(text: str) -> list[str]:
@@ -87,31 +88,58 @@ def split_values(text: str) -> list[str]:
     return [piece.strip() for piece in pieces]
 
 
-def _combined(written: Sequence[tuple[str, list[str]]]) -> Iterator[Variant]:
+def sweep_name(name: str, variant: Variant) -> str:
+    """What the results of a job's sweep are called: `honey-viscosity-sweep`."""
+    keys = [key for key, _ in variant.values]
+    return f"{name}-{_cut('-'.join(map(_plain, keys)), always=not _are_plain(keys), by=repr(keys))}-sweep"
+
+
+def _combined(written: Sequence[tuple[str, list[str]]], job: Job) -> Iterator[Variant]:
     varying = [key for key, values in written if len(values) > 1]
-    short = _short_names(varying)
+    short = _short_names(varying, job)
     suffixes = Counter[str]()
     for combination in product(*(values for _, values in written)):
         setting = dict(zip((key for key, _ in written), combination, strict=True))
         values = tuple((short[key], setting[key]) for key in varying)
         suffix = "-".join(f"{_plain(key)}-{_plain(value)}" for key, value in values)
         suffixes[suffix] += 1
-        if len(suffix) > LONGEST_SUFFIX or suffixes[suffix] > 1:
-            suffix = f"{suffix[: LONGEST_SUFFIX - 9]}-{digest_of(repr(values))[:8]}"
+        suffix = _cut(suffix, always=suffixes[suffix] > 1 or not _are_plain(varying), by=repr(values))
         yield Variant(values, tuple(f"{key}={value}" for key, value in setting.items()), suffix)
 
 
-def _short_names(keys: Sequence[str]) -> dict[str, str]:
-    """The fewest last parts of each key that tell it from the others."""
+def _short_names(keys: Sequence[str], job: Job) -> dict[str, str]:
+    """The fewest last parts of each key that tell it from the others, and from that key of the job's other bodies."""
     names = {}
     for key in keys:
         parts = key.split(".")
         tails = [".".join(parts[-count:]) for count in range(1, len(parts) + 1)]
-        others = [other for other in keys if other != key]
+        others = [other for other in (*keys, *_of_others(parts, job)) if other != key]
         names[key] = next(
             (tail for tail in tails if not any(other == tail or other.endswith(f".{tail}") for other in others)), key
         )
     return names
+
+
+def _of_others(parts: Sequence[str], job: Job) -> list[str]:
+    """The same key of the other bodies, materials, ... of the job."""
+    table = getattr(job, parts[0], None)
+    if len(parts) < 3 or not isinstance(table, dict | tuple):
+        return []
+    named = [str(getattr(each, "name", each)) for each in table]
+    own = named[int(parts[1])] if parts[1].isdecimal() and int(parts[1]) < len(named) else parts[1]
+    return [".".join((parts[0], name, *parts[2:])) for name in named if name != own]
+
+
+def _cut(text: str, *, always: bool, by: str) -> str:
+    """A text, with a digest of what it stands for where it is too long, or `always`."""
+    if len(text) <= LONGEST_SUFFIX and not always:
+        return text
+    return f"{text[: LONGEST_SUFFIX - 9]}-{digest_of(by)[:8]}"
+
+
+def _are_plain(keys: Sequence[str]) -> bool:
+    """Whether names can say them with all their letters."""
+    return all(_plain(key) == key for key in keys)
 
 
 def _plain(text: str) -> str:

@@ -67,3 +67,11 @@ def write_table(made: Made, path: Path) -> int:
     if lines:
         replace_durably(path, text.getvalue())
     return len(lines)
+
+
+def jobs_of_table(path: Path) -> set[str]:
+    """Names of the jobs in a table that `write_table` wrote; none if there is no table."""
+    if not path.exists():
+        return set()
+    with path.open(encoding="utf-8", newline="") as file:
+        return {line.get("job") or "what is no job" for line in csv.DictReader(file)}

@@ -5,8 +5,12 @@ import re
 import pytest
 
 from pipeline.base.errors import JobFileError
-from pipeline.job.sweep import LONGEST_SUFFIX, split_values, variants
+from pipeline.job.loading import make_job
+from pipeline.job.sweep import LONGEST_SUFFIX, split_values, sweep_name, variants
 from pipeline.model.job import NAME_PATTERN
+
+BLOCK = {"shape": {"type": "box", "size": [0.1, 0.1, 0.1]}, "position": [0.0, 0.0, 0.3]}
+JOB = make_job(name="job", fluid=[{"name": "water", "block": [BLOCK]}]).job
 
 
 @pytest.mark.parametrize(
@@ -30,7 +34,7 @@ def test_values_end_at_commas_outside_brackets_and_quotes(text, values):
 
 
 def test_every_combination_is_a_job_and_the_last_key_changes_fastest():
-    found = variants(["fluid.water.viscosity=0.1,1", "fps=30,60", "render.quality=draft"])
+    found = variants(["fluid.water.viscosity=0.1,1", "fps=30,60", "render.quality=draft"], JOB)
     assert [each.overrides for each in found] == [
         ("fluid.water.viscosity=0.1", "fps=30", "render.quality=draft"),
         ("fluid.water.viscosity=0.1", "fps=60", "render.quality=draft"),
@@ -42,8 +46,33 @@ def test_every_combination_is_a_job_and_the_last_key_changes_fastest():
 
 
 def test_names_say_which_of_two_keys_of_the_same_last_word_is_meant():
-    found = variants(["fluid.water.viscosity=1,2", "fluid.oil.viscosity=3,4"])
+    found = variants(["fluid.water.viscosity=1,2", "fluid.oil.viscosity=3,4"], JOB)
     assert found[0].suffix == "water.viscosity-1-oil.viscosity-3"
+
+
+def test_a_key_that_another_body_has_too_is_named_with_its_body():
+    fluids = [{"name": name, "block": [BLOCK]} for name in ("water", "oil")]
+    two = make_job(name="job", fluid=fluids, material={name: {"roughness": 0.5} for name in ("oil", "water")}).job
+    for setting, suffix in (
+        ("fluid.water.viscosity=1,2", "water.viscosity-1"),
+        ("fluid.1.viscosity=1,2", "1.viscosity-1"),
+        ("material.oil.roughness=0,1", "oil.roughness-0"),
+        ("fps=30,60", "fps-30"),
+    ):
+        assert variants([setting], two)[0].suffix == suffix
+
+
+def test_results_are_called_by_the_keys():
+    def name(*settings: str) -> str:
+        return sweep_name("job", variants(settings, JOB)[0])
+
+    assert name("fluid.water.viscosity=1,2", "fps=30") == "job-viscosity-sweep"
+    assert name("fps=30,60", "fluid.water.viscosity=1,2") == "job-fps-viscosity-sweep"
+    named = {
+        name(f"material.{each}.roughness=0,1", f"material.{other}.roughness=0,1") for each, other in ("水油", "油水")
+    }
+    assert len(named) == 2 and all(re.fullmatch(NAME_PATTERN, each) for each in named)
+    assert len(name(*(f"{'k' * 20}{number}=1,2" for number in range(5)))) < 90
 
 
 @pytest.mark.parametrize(
@@ -57,16 +86,16 @@ def test_names_say_which_of_two_keys_of_the_same_last_word_is_meant():
     ],
 )
 def test_names_are_sane_on_disk_and_each_is_there_once(settings):
-    found = variants(settings)
+    found = variants(settings, JOB)
     names = [f"job-{each.suffix}" for each in found]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch(NAME_PATTERN, name) for name in names)
     assert all(len(each.suffix) <= LONGEST_SUFFIX for each in found)
-    assert names == [f"job-{each.suffix}" for each in variants(settings)]  # so that the same command goes on
+    assert names == [f"job-{each.suffix}" for each in variants(settings, JOB)]  # so that the same command goes on
 
 
 def test_a_value_that_is_given_twice_is_one_job():
-    assert len(variants(["fps=30,60,30"])) == 2
+    assert len(variants(["fps=30,60,30"], JOB)) == 2
 
 
 @pytest.mark.parametrize(
@@ -81,6 +110,6 @@ def test_a_value_that_is_given_twice_is_one_job():
 )
 def test_what_is_no_sweep_is_refused_with_all_that_is_wrong(settings, parts):
     with pytest.raises(JobFileError) as caught:
-        variants(settings)
+        variants(settings, JOB)
     for part in parts:
         assert part in str(caught.value)

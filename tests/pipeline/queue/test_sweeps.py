@@ -199,10 +199,10 @@ samples = 1
         "sweep", job, "--set", "camera.position=[0,-1.5,0.5],[1.1,-1.1,0.8]", "--farm", tmp_path / "renders"
     )
     assert result.exit_code == 0, result.output
-    with Image.open(tmp_path / "renders" / "drop-sweep.png") as sheet:
+    with Image.open(tmp_path / "renders" / "drop-position-sweep.png") as sheet:
         assert sheet.width > 2 * 96  # two frames of each job in a row ...
         assert sheet.height > 2 * 54  # ... and a row for each
-    with (tmp_path / "renders" / "drop-sweep.csv").open(newline="") as file:
+    with (tmp_path / "renders" / "drop-position-sweep.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
     assert [(line["position"], line["frame"]) for line in lines] == [
         ("[0,-1.5,0.5]", "0"),
@@ -212,3 +212,13 @@ samples = 1
     ]
     assert float(lines[0]["water.particle_count"]) > 0
     assert lines[0]["water.kinetic_energy"] == lines[2]["water.kinetic_energy"]  # it is the same simulation
+
+    table = tmp_path / "renders" / "drop-position-sweep.csv"
+    written = table.read_bytes()
+    again = ("--dry-run", "--farm", tmp_path / "renders")
+    refused = pipeline("sweep", job, "--set", "camera.position=[0,-1.5,0.5],[0,-2,0.5]", *again)
+    assert refused.exit_code == 1
+    assert "drop-position-sweep.csv is of another sweep, with drop-position-1.1_-1.1_0.8" in refused.stderr
+    for setting in ("camera.position=[0,-1.5,0.5],[1.1,-1.1,0.8],[0,-2,0.5]", "camera.focal_length_mm=35,50"):
+        assert pipeline("sweep", job, "--set", setting, *again).exit_code == 0
+    assert table.read_bytes() == written
