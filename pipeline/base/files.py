@@ -1,6 +1,7 @@
 """Files that are replaced as a whole, and outlive a power cut."""
 
 import errno
+import fcntl
 import os
 import stat
 from collections.abc import Iterator
@@ -91,3 +92,14 @@ def stamp_of(path: Path) -> tuple[int, int, int] | None:
     except FileNotFoundError:
         return None
     return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Exclusive among all processes of all machines that use this lock file; held for a few milliseconds."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

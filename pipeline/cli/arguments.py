@@ -44,9 +44,21 @@ output_option = click.option(
     is_eager=True,  # names of jobs are looked up in it
     help="Folder that holds the jobs' folders.",
 )
+
+
+def _known_ends(_context: click.Context, _parameter: click.Parameter, until: tuple[str, ...]) -> tuple[str, ...]:
+    """What is given to --until, refused before anything is read if no job could end there. Raises PlanError."""
+    from pipeline.run.plan import require_ends
+    from pipeline.stages import STAGES
+
+    require_ends(until, STAGES)
+    return until
+
+
 until_option = click.option(
     "--until",
     multiple=True,
+    callback=_known_ends,
     metavar="STAGE",
     help="End after this stage: simulate, surface, cloth, volume, whitewater, render, ...; or after frames of it, as "
     "render:0-9. May be given several times.",

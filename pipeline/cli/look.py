@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from pipeline.queue.job_queue import QueuedJob
     from pipeline.queue.states import JobState
     from pipeline.record.reader import AttemptRow, StageSummary
+    from pipeline.run.plan import Assessment
 
 FOLLOW_INTERVAL_S = 0.5
 _WIDTH = 11  # of the first column; the longest word is `interrupted`
@@ -217,17 +218,12 @@ def explain(
 
 def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
     from pipeline.base.lease import live_holder
-    from pipeline.job.loading import load_job
     from pipeline.queue.states import task_word
     from pipeline.record.reader import ManifestReader
-    from pipeline.run.assessment import assess_job
     from pipeline.store.provenance import origins_of
     from pipeline.store.receipts import read_receipt, verify_artifact
 
-    assessments, _, _ = assess_job(load_job(layout.job_file), layout)
-    found = next((each for each in assessments if each.task.id == task or task in each.task.outputs), None)
-    if found is None:
-        raise PipelineError(f'the job has no task "{task}"{nearest(task, [each.task.id for each in assessments])}')
+    found = _find_task(layout, task)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         state, history = manifest.states().get(found.task.id), manifest.history(found.task.id)
         events = manifest.events(task=found.task.id)
@@ -246,8 +242,10 @@ def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
         }
         click.echo(json.dumps(story, indent=1))
         return
-    word = None if state is None else task_word(state, runs=live_holder(layout.lease) is not None)
-    click.echo(f"{found.task.id}: {word or 'not planned yet'}, {_VERDICT_WORDING[found.verdict.value]}")
+    word = "made" if there else "not planned yet"  # exports are in no plan once they are done
+    if state is not None:
+        word = task_word(state, runs=live_holder(layout.lease) is not None)
+    click.echo(f"{found.task.id}: {word}, {_VERDICT_WORDING[found.verdict.value]}")
     for reason in found.reasons:
         click.echo(f"  {reason.text}")
     click.echo(f"reads   {_shortened(found.task.inputs) or 'the job file only'}")
@@ -268,6 +266,33 @@ def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
         click.echo(_attempt_line(attempt))
     for event in events:
         click.echo(f"  {wording.moment(event.time)}  {event.kind}: {event.message}")
+
+
+def _find_task(layout: JobLayout, task: str) -> Assessment:
+    """A task of the film, else of an export that was made, by its name or a file of it. Raises PipelineError."""
+    from pipeline.job.loading import load_job
+    from pipeline.record.reader import ManifestReader
+    from pipeline.run.assessment import assess_job
+    from pipeline.run.plan import frame_ranges
+    from pipeline.stages import STAGES
+
+    job = load_job(layout.job_file)
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        made = {row.task for row in manifest.artifacts().values()}
+    exports = []
+    for stage in (stage for stage in STAGES if stage.on_demand):
+        theirs = [name for name in made if name.partition("/")[0] == stage.name]
+        frames = [int(end) for name in theirs if (end := name.rpartition("/")[2]).isdecimal()]
+        if theirs:
+            exports.append((f"{stage.name}:{frame_ranges(frames, range(max(frames) + 1))}" if frames else stage.name,))
+    known: list[str] = []
+    for until in ((), *exports):
+        assessments = assess_job(job, layout, until).assessments
+        for each in assessments:
+            if each.task.id == task or task in each.task.outputs:
+                return each
+        known += [each.task.id for each in assessments]
+    raise PipelineError(f'the job has no task "{task}"{nearest(task, known)}')
 
 
 def _print_log(job: str, layout: JobLayout, task: str | None, attempt: int | None, *, follow: bool) -> None:

@@ -75,6 +75,12 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
         click.echo(loaded.job.model_dump_json(indent=2))
         return
     job = loaded.job
+    warning = None
+    try:
+        expected, without_gpu = first_cost(job, size_of(job, findings), until)
+        told, warning = describe(expected, without_gpu), too_long(expected, job)
+    except StageUnavailableError as error:  # what cannot be planned here
+        told = f"what it takes cannot be told here: {error}"
     click.echo(f"{job_file}: ok")
     click.echo(f"  {job.name}: {job.frame_count} frames, {job.film_s:.3g} s at {job.fps} fps")
     for kind in KINDS.values():
@@ -85,13 +91,8 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
     if needs_pictures(until):
         width, height = job.render.resolution
         click.echo(f"  {width} x {height} pixels, {job.render.quality} quality")
-    try:
-        expected, without_gpu = first_cost(job, size_of(job, findings), until)
-    except StageUnavailableError as error:  # what cannot be planned here
-        click.echo(f"  what it takes cannot be told here: {error}")
-        return
-    click.echo(f"  {describe(expected, without_gpu)}")
-    print_warnings([warning for warning in (too_long(expected, job),) if warning])
+    click.echo(f"  {told}")
+    print_warnings([warning] if warning else [])
 
 
 @click.command()

@@ -23,7 +23,7 @@ from pipeline.queue import disk
 from pipeline.record.reader import StageCost
 from pipeline.run.events import Committed, Failed, Finished, RunEvent, RunStarted
 from pipeline.run.plan import Assessment, Verdict
-from pipeline.run.rates import MachineRates, keep, known_rates, measure
+from pipeline.run.rates import MachineRates, known_rates, learn, measure
 from pipeline.stages.base import FileWork
 from pipeline.store.cache import open_bodies
 
@@ -288,9 +288,9 @@ class Teacher:
     def teach(self) -> None:
         """Keep what was learnt, beside what other runs have learnt meanwhile; nothing of a job without a frame."""
         elements = self.elements()
-        rates = known_rates()
-        if elements is not None and rates is not None and self._took:
-            keep(self._taught(rates, disk.size_of(self._job, Findings(elements=elements))))
+        if elements is not None and self._took:
+            size = disk.size_of(self._job, Findings(elements=elements))
+            learn(lambda rates: self._taught(rates, size))
 
     def elements(self) -> dict[str, int] | None:
         """Of each kind of body, as the last frame has them; as the kind counts them where the cache keeps no arrays."""

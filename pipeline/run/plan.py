@@ -80,11 +80,8 @@ def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequen
     with many_objects():
         if not until:
             return in_order([task for stage in stages if not stage.on_demand for task in stage.plan(job, layout)])
-        ends = dict(map(parse_end, until))
+        ends = require_ends(until, stages)
         names = [stage.name for stage in stages]
-        for name in ends:
-            if name not in names:
-                raise PlanError(f'no stage "{name}"; the stages are {", ".join(names)}')
         last = max(names.index(name) for name in ends)
         asked = [stage for stage in stages[: last + 1] if not stage.on_demand or stage.name in ends]
         tasks = in_order([t for stage in asked for t in stage.of_frames(ends.get(stage.name)).plan(job, layout)])
@@ -98,6 +95,19 @@ def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequen
                 theirs = ", ".join(dict.fromkeys(task.stage for task in tasks)) or "none before it"
                 raise PlanError(f'this job has nothing for the stage "{name}"; it has {theirs}')
         return made_from(wanted, tasks)
+
+
+def require_ends(until: Sequence[str], stages: Sequence[Stage]) -> dict[str, frozenset[int] | None]:
+    """Stages after which a job ends, each with its frames that are wanted, None for all.
+
+    Raises PlanError: there is no such stage, or frames are none.
+    """
+    ends = dict(map(parse_end, until))
+    names = [stage.name for stage in stages]
+    for name in ends:
+        if name not in names:
+            raise PlanError(f'no stage "{name}"; the stages are {", ".join(names)}')
+    return ends
 
 
 def parse_end(text: str) -> tuple[str, frozenset[int] | None]:

@@ -11,15 +11,15 @@ import math
 import platform
 import threading
 import time
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.base.files import replacing
+from pipeline.base.files import locked, replacing
 from pipeline.base.parameter_set import digest_of
 from pipeline.base.resources import machine_capacity
 from sim.core.runtime import cache_folder
@@ -115,8 +115,30 @@ def measure() -> MachineRates:
     cores = machine_capacity().cores
     one, together = _rounds_a_second(1), _rounds_a_second(cores)
     rates = MachineRates(one / ROUNDS_OF_REFERENCE, max(one, together) / ROUNDS_OF_REFERENCE, cores)
-    keep(rates)
+    with _alone():
+        if (known := known_rates()) is not None:  # of another process, which was faster
+            return known
+        keep(rates)
     return rates
+
+
+def learn(change: Callable[[MachineRates], MachineRates]) -> None:
+    """Change the rates that are kept, if there are any, whatever other processes learn meanwhile."""
+    with _alone():
+        rates = known_rates()
+        if rates is not None:
+            keep(change(rates))
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Exclude other processes that change the rates; where no lock can be had, what one of two learns is lost."""
+    with ExitStack() as stack:
+        with suppress(OSError):
+            lock = rates_file().with_suffix(".lock")
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(locked(lock))
+        yield
 
 
 def keep(rates: MachineRates) -> None:

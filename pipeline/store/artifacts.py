@@ -24,7 +24,6 @@ kernel drops it with its holder, so none is ever left behind.
 """
 
 import errno
-import fcntl
 import os
 import platform
 import re
@@ -36,7 +35,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
-from pipeline.base.files import make_folder, replace_durably, sync
+from pipeline.base.files import locked, make_folder, replace_durably, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
 from pipeline.store.provenance import keep_texts, maker
@@ -145,7 +144,7 @@ def committing(
         make_folder(receipt_path.parent, within=layout.root)
         receipt_part.write_text(receipt.to_json())
         sync(receipt_part)
-        with _lock(receipt_path.with_name(_LOCK_NAME)):
+        with locked(receipt_path.with_name(_LOCK_NAME)):
             _fence(layout, receipt)
             commit.kept_aside = _invalidate(layout, artifact)
             commit.path.replace(target)
@@ -189,7 +188,7 @@ def take_over(layout: JobLayout, receipt: Receipt, owner: JobLayout) -> None:
     try:
         if (status := part.stat()).st_size != receipt.size or status.st_mtime_ns != receipt.mtime_ns:
             raise FileNotFoundError(errno.ENOENT, "was made anew while it was taken over", str(source))
-        with _lock(receipt_path.with_name(_LOCK_NAME)):
+        with locked(receipt_path.with_name(_LOCK_NAME)):
             _fence(layout, receipt)
             _invalidate(layout, receipt.artifact)
             part.replace(target)
@@ -248,14 +247,3 @@ def _invalidate(layout: JobLayout, artifact: ArtifactPath) -> ArtifactPath | Non
         receipt_path.unlink()
         sync(receipt_path.parent)
     return kept_aside
-
-
-@contextmanager
-def _lock(path: Path) -> Iterator[None]:
-    """Exclusive among all processes of all machines that use this lock file; held for a few milliseconds."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)

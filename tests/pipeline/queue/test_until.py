@@ -80,6 +80,19 @@ def test_a_stage_that_the_job_or_the_program_lacks_is_refused(until, told):
         stages_until(until)
 
 
+@pytest.mark.parametrize(
+    ("until", "told"),
+    [("surface:x", '"x" is not a frame'), ("surfac", 'no stage "surfac"'), ("cloth", 'nothing for the stage "cloth"')],
+)
+def test_an_end_that_is_none_is_refused_before_anything_is_told(tmp_path, monkeypatch, until, told):
+    monkeypatch.chdir(tmp_path)
+    Path("small.toml").write_text(NO_PICTURE)
+    refused = pipeline("check", "small", "--until", until)
+    assert refused.exit_code != 0
+    assert refused.stdout == ""
+    assert told in refused.stderr.splitlines()[-1]
+
+
 def test_what_is_wrong_with_pictures_does_not_count_where_none_is_drawn(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("small.toml").write_text(NO_PICTURE)

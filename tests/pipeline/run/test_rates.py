@@ -1,6 +1,10 @@
 """Rates of a machine: measured once, kept, and better with every run."""
 
+import subprocess
+import sys
+
 import pytest
+from places import PROJECT
 
 from pipeline.run import rates
 from pipeline.run.rates import LARGEST_CORRECTION, MachineRates, keep, known_rates, measure, rates_file
@@ -40,6 +44,24 @@ def test_a_damaged_file_counts_as_none(text):
     assert known_rates() is None
     keep(MachineRates(1.0, 2.0, 2))
     assert known_rates() == MachineRates(1.0, 2.0, 2)
+
+
+LEARNS = """
+import sys
+from pipeline.run.rates import learn
+for number in range(40):
+    learn(lambda rates: rates.taught(f"simulate:cpu:{sys.argv[1]}-{number}", time=2.0, size=1.0, memory=1.0))
+"""
+
+
+def test_processes_that_learn_at_once_lose_nothing_of_each_other(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    keep(MachineRates(1.0, 2.0, 2))
+    processes = [subprocess.Popen([sys.executable, "-c", LEARNS, name], cwd=PROJECT) for name in "abc"]
+    assert [process.wait() for process in processes] == [0, 0, 0]
+    rates = known_rates()
+    assert rates is not None and len(rates.learnt) == 3 * 40
+    assert measure() == rates  # who comes to measure now takes nothing back
 
 
 def test_the_first_run_of_a_kind_of_work_is_believed_and_later_ones_move_it():

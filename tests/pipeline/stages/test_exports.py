@@ -208,6 +208,14 @@ def test_after_an_export_what_is_asked_of_a_job_is_its_film_again(usd):
     assert not any(end.startswith("export-") for end in read_goal(usd.layout))
 
 
+def test_tasks_and_files_of_every_export_are_explained_whichever_was_the_last(usd):
+    usd.run("export", "tiny", "--to", "vtk", "--frames", "0-1").assert_code(0)
+    for task in (f"export-usd/{LAST:06d}", "export-vtk/000001", f"usd/{LAST:06d}.usdc", "tiny.usd"):
+        told = usd.run("explain", "tiny", task).assert_code(0).out
+        assert "up to date" in told.partition("\n")[0], told
+    usd.run("explain", "tiny", "export-gltf").assert_code(1)
+
+
 def test_the_same_usd_has_the_same_bytes(usd):
     names = ["tiny.usd", "usd/manifest.usda", f"usd/{LAST:06d}.usdc"]
     before = [(usd.layout.root / name).read_bytes() for name in names]
