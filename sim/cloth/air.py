@@ -11,7 +11,7 @@ from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
 from sim.core.arrays import Integers, Vectors
 from sim.core.launch import kernel
-from sim.core.parameters import KeyRefusedError
+from sim.core.parameters import KeyRefusedError, Vector3
 
 WIND = -1
 """Source of air that is nothing but the wind of a cloth's parameters."""
@@ -91,7 +91,7 @@ class ClothAir:
         self.velocity.from_numpy(np.where(is_wind[:, None], wind_of, self.velocity.to_numpy()))
         self.acts = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
 
-    def predict(self, cloths: range, gravity: ti.math.vec3, dt: float) -> None:
+    def predict(self, cloths: range, gravity: Vector3, dt: float) -> None:
         """Accelerate some cloths by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
         state = self._state
         triangles, nodes = (

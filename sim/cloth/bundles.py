@@ -414,7 +414,7 @@ class PushedNodes(NamedTuple):
 class NodeSums(NamedTuple):
     """Numbers of each node that are found as contacts are weighed."""
 
-    counter: Integers  # contacts that push, nodes that they push, and how often; whether contacts miss much, (4,)
+    counter: Integers  # contacts that push, their nodes, and uses; whether any misses much, is settled, (5,)
     predicted: Vectors  # displacement without contacts [m], (n,)
     shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
     held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)

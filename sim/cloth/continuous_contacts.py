@@ -124,7 +124,7 @@ class ContinuousContacts:
         )
         self._pushed.support.fill(0.0)
         self._sums = NodeSums(
-            counter=ti.ndarray(ti.i32, 4),
+            counter=ti.ndarray(ti.i32, 5),
             predicted=ti.Vector.ndarray(3, ti.f32, n),
             shares=ti.ndarray(ti.i32, n),
             held_sums=ti.ndarray(ti.i32, 6 * n),
@@ -270,9 +270,9 @@ class ContinuousContacts:
         """Push; first in turns with the springs, for as long as these `relax`."""
         short = self._is_short(count)
         while True:
-            pushing, touched, is_missing = self._begin_push(state, count, first=first, short=short)
-            self._iterations += STEPS if pushing else 0
-            if not pushing or not relax():
+            pushing, touched, is_missing, settled = self._begin_push(state, count, first=first, short=short)
+            self._iterations += STEPS if pushing else settled
+            if not (pushing or settled) or not relax():
                 break
             first = 0
         if pushing and is_missing:

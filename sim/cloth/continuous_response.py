@@ -50,6 +50,9 @@ KEPT_BY_REPAIR = 0.3
 FIRST_OF_ROUND, FIRST_OF_SUBSTEP = 1, 2
 """Pushes that forget the impulses of what was found before; and that note what displacements are without contacts."""
 
+ALONE = -1
+"""In the place of the first use of a vertex: what stands touches it, and nothing else does."""
+
 STEPS = 8
 """Steps of the iteration in one launch: what all iterations have at least."""
 
@@ -94,13 +97,16 @@ def weigh_contacts(
     `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
     without the twelve atomic sums that each contact would otherwise take.
 
+    What stands and touches a vertex that nothing else touches is settled at once: its D is exact, so that one step
+    solves it, and no other contact hears of it. In draped cloth these are most of all that push.
+
     If bodies may move, each vertex between what stands and a body that moves gets its `support`, and its contacts a
     normal along that, from `held_sums`, `lever` and `pressing_body`.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, vertices_end = count, vertex_count
     all_end = ti.max(vertex_count, bodies.count)
-    for k in ti.static(range(4)):
+    for k in ti.static(range(5)):
         sums.counter[k] = 0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -118,6 +124,7 @@ def weigh_contacts(
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for c in range(contacts_end):
+        impulses.mobility[c] = 0.0
         if contacts.floor[c] > 0.5 * INACTIVE:
             free = 0.0
             for k in ti.static(range(4)):
@@ -134,14 +141,18 @@ def weigh_contacts(
                 if most > 0.0:
                     ti.atomic_add(bodies.load[b], ti.cast(ti.ceil(ti.sqrt(most) / bodies.load_unit), ti.i64))
                     free = 1.0
+            if is_of_vertex_and_what_stands(c, contacts, bodies):
+                ti.atomic_add(nodes.uses[2 * contacts.vertices[c][0]], 1)
             if bodies.may_move == 1 and (b >= 0 or b == WALL):
                 hold(c, contacts, most, sums)
             if free >= LEAST_FREE_WEIGHT:
-                impulses.pushing[ti.atomic_add(sums.counter[0], 1)] = c
+                impulses.mobility[c] = 1.0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for i in range(vertices_end):
-        if sums.shares[i] > 0:
+        if nodes.uses[2 * i] == 1 and nodes.uses[2 * i + 1] == 1:
+            nodes.uses[2 * i] = ALONE
+        elif sums.shares[i] > 0:
             nodes.touched[ti.atomic_add(sums.counter[1], 1)] = i
             first = ti.atomic_add(sums.counter[2], nodes.uses[2 * i + 1])
             nodes.uses[2 * i], nodes.uses[2 * i + 1] = first, first
@@ -152,29 +163,72 @@ def weigh_contacts(
                 of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
                 own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
                 nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
-    pushing_end = sums.counter[0]
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for place in range(pushing_end):
-        c = impulses.pushing[place]
-        if is_first > 0:
-            impulses.impulse[c] = ti.math.vec3(0.0)
-        if bodies.may_move == 1 and (contacts.kind[c] >= 0 or contacts.kind[c] == WALL):
-            contacts.normal[c] = turned_to_support(c, contacts, nodes.support)
-        total = 0.0
-        for k in ti.static(range(4)):
-            weight = ti.abs(contacts.weights[c][k])
-            if weight > 0.0:
-                v = contacts.vertices[c][k]
-                own = weight * nodes.inverse_mass[v] * (ti.cast(sums.shares[v], ti.f32) / SHARES_PER_UNIT)
-                total += answer_of(nodes.support[v]) * own
-                use = ti.atomic_add(nodes.uses[2 * v + 1], 1)
-                impulses.used_by[use], impulses.use_weight[use] = place, contacts.weights[c][k]
-        b = contacts.kind[c]
-        if b >= 0:
-            most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
-            total += ti.sqrt(most) * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
-        impulses.mobility[c] = total
+    for c in range(contacts_end):
+        if impulses.mobility[c] > 0.0:
+            if is_first > 0:
+                impulses.impulse[c] = ti.math.vec3(0.0)
+            v = contacts.vertices[c][0]
+            if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
+                impulses.mobility[c] = nodes.inverse_mass[v]
+                settle(c, contacts, impulses, nodes, bodies)
+                sums.counter[4] = 1
+            else:
+                place = ti.atomic_add(sums.counter[0], 1)
+                impulses.pushing[place] = c
+                impulses.mobility[c] = weighed(c, place, contacts, impulses, nodes, sums, bodies)
+
+
+@func
+def weighed(
+    c: ti.i32,
+    place: ti.i32,
+    contacts: Contacts,
+    impulses: Impulses,
+    nodes: PushedNodes,
+    sums: NodeSums,
+    bodies: PushedBodies,
+) -> ti.f32:
+    """The diagonal D of a contact, which gets its place among the uses of its vertices, and its normal."""
+    if bodies.may_move == 1 and (contacts.kind[c] >= 0 or contacts.kind[c] == WALL):
+        contacts.normal[c] = turned_to_support(c, contacts, nodes.support)
+    total = 0.0
+    for k in ti.static(range(4)):
+        weight = ti.abs(contacts.weights[c][k])
+        if weight > 0.0:
+            v = contacts.vertices[c][k]
+            own = weight * nodes.inverse_mass[v] * (ti.cast(sums.shares[v], ti.f32) / SHARES_PER_UNIT)
+            total += answer_of(nodes.support[v]) * own
+            use = ti.atomic_add(nodes.uses[2 * v + 1], 1)
+            impulses.used_by[use], impulses.use_weight[use] = place, contacts.weights[c][k]
+    b = contacts.kind[c]
+    if b >= 0:
+        most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
+        total += ti.sqrt(most) * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
+    return total
+
+
+@func
+def is_of_vertex_and_what_stands(c: ti.i32, contacts: Contacts, bodies: PushedBodies) -> ti.u1:
+    """Whether a contact is one of a single vertex with a wall, or with a body that no push moves."""
+    b = contacts.kind[c]
+    stands = b == WALL
+    if b >= 0:
+        stands = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b]) == 0.0
+    return stands and contacts.weights[c][0] == 1.0
+
+
+@func
+def settle(c: ti.i32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies):
+    """Push the only vertex of a contact, which has no other, by all that it lacks."""
+    v, before = contacts.vertices[c][0], impulses.impulse[c]
+    after = answered(c, before, contacts, impulses, nodes.displacement, bodies.motion)
+    push = (after - before) / impulses.unit
+    impulses.impulse[c] = after
+    nodes.displacement[v] += (nodes.inverse_mass[v] * impulses.unit) * ti.round(push)
+    if contacts.kind[c] >= 0:
+        give_body(push, contacts.kind[c], contacts.arm[c], bodies.impulse)
 
 
 @func
@@ -363,15 +417,8 @@ def push_contact(
 ):
     """What a contact gives in a step, from its place in `pushing`."""
     c = impulses.pushing[place]
-    n = contacts.normal[c]
-    w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
     ahead = impulses.impulse[c] + momentum * (impulses.impulse[c] - impulses.impulse_before[c])
-    along = ti.max(ahead.dot(n) + (contacts.floor[c] - w.dot(n)) / impulses.mobility[c], 0.0)
-    sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / impulses.mobility[c]
-    held, length = contacts.friction[c] * along, sideways.norm()
-    if length > held:
-        sideways *= held / length
-    after = along * n + sideways
+    after = answered(c, ahead, contacts, impulses, nodes.displacement, bodies.motion)
     impulses.impulse_before[c] = impulses.impulse[c]
     impulses.impulse[c] = after
     impulses.push[place] = (after - ahead) / impulses.unit
@@ -382,6 +429,21 @@ def push_contact(
         most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
     if most > 0.0:
         give_body(impulses.push[place], b, contacts.arm[c], bodies.gathered)
+
+
+@func
+def answered(
+    c: ti.i32, ahead: ti.math.vec3, contacts: Contacts, impulses: Impulses, displacement: Vectors, body_motion: Vectors
+) -> ti.math.vec3:
+    """The impulse of a contact that has one, by which displacements lead, after a step of the residual over D."""
+    n = contacts.normal[c]
+    w = relative_displacement(c, contacts, displacement, body_motion)
+    along = ti.max(ahead.dot(n) + (contacts.floor[c] - w.dot(n)) / impulses.mobility[c], 0.0)
+    sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / impulses.mobility[c]
+    held, length = contacts.friction[c] * along, sideways.norm()
+    if length > held:
+        sideways *= held / length
+    return along * n + sideways
 
 
 @func
@@ -459,11 +521,11 @@ def begin_push(
     bodies: PushedBodies,
     is_first: ti.i32,
     is_short: ti.template(),
-) -> ti.math.ivec3:
+) -> ti.math.ivec4:
     """A round of contacts in one launch: which of them push, some steps of the iteration, and where these lead.
 
-    Returns how many contacts push, how many vertices they push, and whether any is below its floor by more than
-    `TOLERANCE`.
+    Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
+    `TOLERANCE`, and whether any are settled.
     """
     weigh_contacts(count, contacts, impulses, vertex_count, nodes, sums, bodies, is_first, is_short)
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
@@ -477,7 +539,7 @@ def begin_push(
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
             sums.counter[3] = 1
-    return ti.math.ivec3(pushing_count, touched_count, sums.counter[3])
+    return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])
 
 
 @kernel

@@ -13,7 +13,7 @@ from sim.cloth.bundles import PatchElements, PatchNodes
 if TYPE_CHECKING:
     from sim.cloth.state import HostCloths
 
-TRIANGLES_PER_PATCH = 24
+TRIANGLES_PER_PATCH = 32
 """Most triangles of a patch: few enough for all of them to move nearly as one, and enough for one pair of patches to
 stand for hundreds of pairs of elements."""
 

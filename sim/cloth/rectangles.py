@@ -94,7 +94,7 @@ class RectangleSprings:
                     blocks,
                     parity,
                     self._rectangle,
-                    ti.math.vec2(self._grid.step_x, self._grid.step_y),
+                    self._steps[::-1],
                     self._cell_stiffness,
                     state.quantum,
                     dt * dt,

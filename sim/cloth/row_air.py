@@ -12,6 +12,7 @@ from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
+from sim.core.parameters import Vector3
 from sim.core.scheduling import is_short
 
 LEAST_SQUARE = 1.0e-30
@@ -44,7 +45,7 @@ class RectangleAir:
             mass=cloth.mass_per_area * 0.5 * self._grid.step_x * self._grid.step_y,
         )
 
-    def predict(self, gravity: ti.math.vec3, dt: float) -> None:
+    def predict(self, gravity: Vector3, dt: float) -> None:
         """Accelerate the nodes by gravity [m/s²] and air for dt [s]; displacements become where that leads."""
         state = self._state
         predict_in_wind(

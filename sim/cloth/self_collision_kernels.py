@@ -114,15 +114,15 @@ def pair_vertices_with_triangles(
             place += lanes
             x = surface.position[v]
             if (x >= least).all() and (x <= most).all():
-                below, above = x - met.reach[p], x + met.reach[p]
+                within = met.reach[p] * met.reach[p]
                 for block in range(blocks.first_block[other], blocks.first_block[other + 1]):
                     near = 0
                     for k in range(BLOCK):
                         t = block * BLOCK + k
-                        is_beside = blocks.low_x[t] < above[0] and blocks.high_x[t] > below[0]
-                        is_beside = is_beside and blocks.low_y[t] < above[1] and blocks.high_y[t] > below[1]
-                        is_beside = is_beside and blocks.low_z[t] < above[2] and blocks.high_z[t] > below[2]
-                        near |= ti.cast(is_beside, ti.i32) << k
+                        dx = ti.max(blocks.low_x[t] - x[0], x[0] - blocks.high_x[t], 0.0)
+                        dy = ti.max(blocks.low_y[t] - x[1], x[1] - blocks.high_y[t], 0.0)
+                        dz = ti.max(blocks.low_z[t] - x[2], x[2] - blocks.high_z[t], 0.0)
+                        near |= ti.select(dx * dx + dy * dy + dz * dz <= within, 1, 0) << k
                     while near != 0:
                         t = block * BLOCK + lowest_bit(near)
                         near &= near - 1
@@ -155,8 +155,8 @@ def pair_edges(
 ):
     """List the edges of two patches that are near each other and share no vertex, as one of several threads.
 
-    Edges are first told apart by their shadows on the line through their midpoints, which are disjoint for most
-    neighbours in flat cloth; spheres around them do not.
+    Edges are first told apart by their shadows on the line through their midpoints, and on what of that is across the
+    first of them: disjoint for most neighbours in flat cloth, where spheres around them are not.
     """
     soonest = NEVER
     m, other = met.pairs[p][0], met.pairs[p][1]
@@ -169,6 +169,7 @@ def pair_edges(
         g, h, i = blocks.half_x[place], blocks.half_y[place], blocks.half_z[place]
         place += lanes
         middle, half = ti.math.vec3(x, y, z), ti.math.vec3(g, h, i)
+        steep = ti.max(half.norm_sqr(), 1.0e-30)
         if (middle + ti.abs(half) >= least).all() and (middle - ti.abs(half) <= most).all():
             for block in range(
                 ti.select(m == other, own // BLOCK, blocks.first_block[other]), blocks.first_block[other + 1]
@@ -178,10 +179,15 @@ def pair_edges(
                     f = block * BLOCK + k
                     dx, dy, dz = blocks.mid_x[f] - x, blocks.mid_y[f] - y, blocks.mid_z[f] - z
                     squared = dx * dx + dy * dy + dz * dz
-                    shadows = ti.abs(g * dx + h * dy + i * dz)
-                    shadows += ti.abs(blocks.half_x[f] * dx + blocks.half_y[f] * dy + blocks.half_z[f] * dz)
-                    beyond = ti.max(squared - shadows, 0.0)
-                    near |= ti.select(beyond * beyond <= within * squared, 1, 0) << k
+                    own_shadow = g * dx + h * dy + i * dz
+                    shadow = blocks.half_x[f] * dx + blocks.half_y[f] * dy + blocks.half_z[f] * dz
+                    beyond = ti.max(squared - ti.abs(own_shadow) - ti.abs(shadow), 0.0)
+                    is_near = beyond * beyond <= within * squared
+                    along = own_shadow / steep
+                    across = ti.max(squared - along * own_shadow, 0.0)
+                    shadow -= along * (blocks.half_x[f] * g + blocks.half_y[f] * h + blocks.half_z[f] * i)
+                    beyond = ti.max(across - ti.abs(shadow), 0.0)
+                    near |= ti.select(is_near and beyond * beyond <= within * across, 1, 0) << k
                 if m == other and block == own // BLOCK:
                     # Each pair once: only edges after this one.
                     near &= -2 << (own % BLOCK)

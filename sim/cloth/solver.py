@@ -313,7 +313,7 @@ class ClothSolver:
 
     def _predict(self, dt: float) -> None:
         """Gravity and air: of rectangles in nothing but wind by rows, of all others by lists of triangles."""
-        air, gravity = self.air, ti.math.vec3(*self.gravity)
+        air, gravity = self.air, self.gravity
         in_rows = self._rectangles_in_wind if air.acts and not air.is_shared else {}
         for rectangle in in_rows.values():
             rectangle.predict(gravity, dt)
