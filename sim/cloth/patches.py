@@ -9,13 +9,14 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import PatchElements, PatchNodes
+from sim.core.reductions import runs_on_gpu
 
 if TYPE_CHECKING:
     from sim.cloth.state import HostCloths
 
-TRIANGLES_PER_PATCH = 32
+TRIANGLES_PER_PATCH, ON_GPU = 32, 24
 """Most triangles of a patch: few enough for all of them to move nearly as one, and enough for one pair of patches to
-stand for hundreds of pairs of elements."""
+stand for hundreds of pairs of elements; on a GPU fewer, as the threads of a pair work longer than those of others."""
 
 
 class Patches:
@@ -75,9 +76,9 @@ def _patch_of_triangles(host: HostCloths) -> NDArray[np.int64]:
     """Number of the patch of each triangle, (k,)."""
     patch = np.zeros(len(host.triangles), dtype=np.int64)
     centre = host.position[host.triangles].mean(axis=1)
-    count = 0
+    most, count = ON_GPU if runs_on_gpu() else TRIANGLES_PER_PATCH, 0
     for first, last in zip(host.first_triangle[:-1], host.first_triangle[1:], strict=True):
-        halvings = max(int(np.ceil(np.log2(max(last - first, 1) / TRIANGLES_PER_PATCH))), 0)
+        halvings = max(int(np.ceil(np.log2(max(last - first, 1) / most))), 0)
         order = np.arange(first, last)
         for level in range(halvings):
             # All parts of a level at once: each is sorted along its own longest extent, and cut in its middle.

@@ -41,7 +41,7 @@ class SelfCollision:
 
     Every crossing of two triangles without a common corner, or with one, begins with a vertex that meets a triangle of
     which it is no corner, or with two edges without a common vertex that meet; so these are all pairs. Patches of some
-    twenty triangles that may meet within some substeps are paired first; each pair of patches has a list of its
+    thirty triangles that may meet within some substeps are paired first; each pair of patches has a list of its
     elements within thickness + skin, which holds until their motion, apart from rigid motion in common, has used the
     skin up. What is found in the lists does not depend on when they were made.
 

@@ -33,8 +33,8 @@ triangles, vertices alone then push."""
 END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
-LANES = 8
-"""Threads of a GPU that search a pair of patches: enough to share out the work of a few of them."""
+LANES = 32
+"""Threads of a GPU that search a pair of patches: one for each edge or so, as few pairs are searched at rest."""
 
 
 def lanes_of_pair() -> int:

@@ -1,7 +1,8 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -9,7 +10,6 @@ from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir
 from sim.cloth.cells import cells_of
-from sim.cloth.contacts import ClothContacts
 from sim.cloth.device_cells import DeviceCells
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
@@ -70,6 +70,29 @@ LIVE_KEYS = frozenset(
     )
 )
 """What may change between frames."""
+
+
+class ClothContacts(Protocol):
+    """A kind of contact: of cloths with themselves and each other, with bodies, with walls."""
+
+    def stable_dt(self, state: ClothState, at_most: float) -> float:
+        """Largest step [s] for the current state, `at_most` this one."""
+
+    def resolve(self, state: ClothState, dt: float, relax: Callable[[], bool]) -> None:
+        """Change the displacements of a step of dt [s], after the springs have; pinned nodes stay as they are.
+
+        Args:
+            state: with displacements.
+            dt: [s].
+            relax: lets the springs change displacements once more where contacts stretched them too much, and says
+                whether it did; contacts are resolved again then.
+        """
+
+    def begin_frame(self) -> None:
+        """Reset the counters of the frame, and forget what a run that continues here would not know."""
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """Numbers about the contacts of the frame, by name."""
 
 
 class ClothSolver:

@@ -5,10 +5,9 @@ import pytest
 from cloth_scenes import cloth
 
 from sim.cloth.cells import TRIANGLE, cells_of
-from sim.cloth.colouring import greedy_colours
 from sim.cloth.parameters import RectangleSheet
 from sim.cloth.sheet import RestSheet, build_sheet, sheet_of_triangles
-from sim.cloth.springs import edges_of, joined_cells, joined_springs, springs_of
+from sim.cloth.springs import edges_of, greedy_colours, joined_cells, joined_springs, springs_of
 from sim.shapes.solid import ShapeError
 
 STIFFNESS = {"stretch_stiffness": 300.0, "shear_stiffness": 70.0, "bend_stiffness": 2.0e-3}
