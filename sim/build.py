@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +23,8 @@ from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.kernels import Discretization
-from sim.fluid.opening import Opening, opening_problem, openings_of, pipes
+from sim.fluid.emitter import Carrier
+from sim.fluid.opening import Opening, opening_problem, openings_of, placed_on
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
 
     from sim.core.domain import DomainParameters
     from sim.fluid.fluid import SPHFluid
+    from sim.fluid.parameters import EmitterParameters, FluidParameters
+    from sim.rigid.parameters import RigidBodyParameters
     from sim.scene import SceneParameters
     from sim.shapes.solid import Solid
 
@@ -102,9 +105,10 @@ def _build_fluids(
     volume = discretization.particle_volume
     movers = [body for body in scene.rigid if body.kind != "static"]
     solids = [*(body.solid for body in static), *(build_solid(body) for body in movers)]
-    around = pipes(_build_openings(scene, solids, spacing, volume), spacing)
-    sheets = [] if cloth is None else [cloth.start]
-    filling = fill_fluids(scene.fluid, scene.domain, solids, np.concatenate([NO_POINTS, *around, *sheets]))
+    fluids = fluids_with_emitters_on(scene.fluid, scene.rigid)
+    followed = {body.name: body for body in movers}
+    _check_openings(fluids, scene, solids, followed, spacing, volume)
+    filling = fill_fluids(fluids, scene.domain, solids, NO_POINTS if cloth is None else cloth.start)
     speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]
     speeds += [] if cloth is None else [expected_cloth_speed(scene.cloth, cloth.start, scene.domain, scene.gravity)]
     samples = [
@@ -116,32 +120,70 @@ def _build_fluids(
         )
         for body in static
     ]
+    carriers = {}
+    if rigid is not None:
+        arms = [solid.centre_of_mass for solid in rigid.solids]
+        carriers = {name: Carrier(number, arms[number]) for number, name in enumerate(rigid.bodies.names)}
     start = FluidStart(
-        scene.fluid,
+        fluids,
         domain=scene.domain,
         gravity=scene.gravity,
         positions=filling.positions,
         velocities=filling.velocities,
         phase=filling.phase,
-        boundary=BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples, *around),
+        boundary=BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples),
         moving=BoundarySamples.of_bodies() if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
         sheets=None if cloth is None else cloth.sheets,
         body_count=len(movers),
         body_speed=max(speeds, default=0.0),
-        capacity=particle_capacity(scene.fluid, scene.domain, filling, volume),
+        followed=followed,
+        carriers=carriers,
+        capacity=particle_capacity(fluids, scene.domain, filling, volume),
     )
     return SOLVERS[scene.fluid[0].solver](start)
 
 
-def _build_openings(scene: SceneParameters, solids: list[Solid], spacing: float, volume: float) -> list[Opening]:
-    """The openings of all fluids, which must be free, and not in each other's way."""
-    names = [f'fluid "{fluid.name}" emitter[{number}]' for fluid in scene.fluid for number in range(len(fluid.emitter))]
+def fluids_with_emitters_on(
+    fluids: Sequence[FluidParameters], bodies: Sequence[RigidBodyParameters]
+) -> tuple[FluidParameters, ...]:
+    """The fluids with their emitters on static bodies where these stand; only those on bodies that move still follow.
+
+    Raises:
+        ValueError: an emitter follows a body that is not there.
+    """
+    by_name = {body.name: body for body in bodies}
+
+    def placed(fluid: FluidParameters, number: int, emitter: EmitterParameters) -> EmitterParameters:
+        if emitter.follow is None:
+            return emitter
+        if emitter.follow not in by_name:
+            raise ValueError(f'fluid "{fluid.name}" emitter[{number}]: no rigid body is named "{emitter.follow}"')
+        body = by_name[emitter.follow]
+        return placed_on(emitter, body) if body.kind == "static" else emitter
+
+    return tuple(
+        fluid.model_copy(
+            update={"emitter": tuple(placed(fluid, number, each) for number, each in enumerate(fluid.emitter))}
+        )
+        for fluid in fluids
+    )
+
+
+def _check_openings(
+    fluids: Sequence[FluidParameters],
+    scene: SceneParameters,
+    solids: list[Solid],
+    followed: Mapping[str, RigidBodyParameters],
+    spacing: float,
+    volume: float,
+) -> None:
+    """Raise ValueError unless the openings of all fluids are free, and not in each other's way."""
+    names = [f'fluid "{fluid.name}" emitter[{number}]' for fluid in fluids for number in range(len(fluid.emitter))]
     openings: dict[str, Opening] = {}
-    for name, (_, opening) in zip(names, openings_of(scene.fluid, volume), strict=True):
+    for name, (_, opening) in zip(names, openings_of(fluids, volume, followed), strict=True):
         if reason := opening_problem(opening, spacing, scene.domain, solids, openings):
             raise ValueError(f"{name}: {reason}")
         openings[name] = opening
-    return list(openings.values())
 
 
 def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: float) -> NDArray[np.float32]:

@@ -51,7 +51,7 @@ class FluidRigidCoupling(Coupling):
 
     def exchange(self, dt: float) -> None:
         """Hand the fluid's impulses of its substep of dt [s] to the bodies."""
-        linear, angular = self._fluid.body_forces.take_impulses()
+        linear, angular = (each[: len(self._rigid.bodies)] for each in self._fluid.body_forces.take_impulses())
         self._rigid.bodies.apply_impulses(linear, angular)
         self.force = linear / dt
 

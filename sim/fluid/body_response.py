@@ -78,7 +78,13 @@ class BodyResponse:
         self.inverse_masses: NDArray[np.float64] = np.zeros((boundary.body_count, WRENCH_WIDTH, WRENCH_WIDTH))
 
     def set_mobility(self, inverse_mass: NDArray[np.float64], inverse_inertia: NDArray[np.float64]) -> None:
-        """Take inverse masses [1/kg], (bodies,), 0 on given paths, and tensors in world axes, (bodies, 3, 3)."""
+        """Take inverse masses [1/kg], (bodies,), 0 on given paths, and tensors in world axes, (bodies, 3, 3).
+
+        Emitters' pistons, which are the last of the boundary's bodies, are on given paths and may be left out.
+        """
+        pistons = self._boundary.body_count - len(inverse_mass)
+        inverse_mass = np.pad(inverse_mass, (0, pistons))
+        inverse_inertia = np.pad(inverse_inertia, ((0, pistons), (0, 0), (0, 0)))
         rows = np.concatenate([inverse_mass[:, None], inverse_inertia.reshape(-1, 9)], axis=1)
         self.is_needed = bool((inverse_mass > 0.0).any())
         self.inverse_masses[:, :3, :3] = inverse_mass[:, None, None] * np.eye(3)

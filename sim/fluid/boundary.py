@@ -74,6 +74,13 @@ class BodyStates(NamedTuple):
     angular_velocity: NDArray[np.float64]  # [rad/s], (bodies, 3)
 
 
+def states_of(rows: NDArray[np.generic]) -> BodyStates:
+    """Bodies whose states stand one after the other, `STATE_WIDTH` numbers each."""
+    of_bodies = rows.reshape(-1, STATE_WIDTH)
+    rotations = of_bodies[:, 3:12].reshape(-1, 3, 3)
+    return BodyStates(of_bodies[:, :3], rotations, of_bodies[:, 12:15], of_bodies[:, 15:])
+
+
 class Boundary:
     """Samples of walls and bodies, as the sums over neighbours read them.
 

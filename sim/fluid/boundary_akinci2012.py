@@ -13,6 +13,7 @@ layer, whose push alone lets nothing pass.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -71,6 +72,12 @@ class BoundarySamples:
             [getattr(each, field.name) for field in fields(cls)] for each in own or [cls.of_points(np.empty((0, 3)))]
         ]
         return cls(*(np.concatenate(parts) for parts in zip(*arrays, strict=True)))
+
+    def with_bodies(self, bodies: Sequence[BoundarySamples], first: int) -> BoundarySamples:
+        """These samples and then those of further bodies, numbered from the first."""
+        own = [self, *(replace(each, body=each.body + number) for number, each in enumerate(bodies, start=first))]
+        arrays = ([getattr(each, field.name) for each in own] for field in fields(self))
+        return BoundarySamples(*map(np.concatenate, arrays))
 
     def scaled(self, factor: float | NDArray[np.float64]) -> BoundarySamples:
         """The same samples with so many times their volumes [-], all of them or each, (m,)."""

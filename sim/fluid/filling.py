@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.opening import openings_of, pipe_clearance
+from sim.fluid.opening import openings_of
 from sim.shapes.placement import build_solid
 from sim.shapes.sampling import fill_with_particles
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 CLEARANCE_IN_SPACINGS = 0.5  # a particle's centre keeps half a lattice spacing, its radius, from walls and solids
 TAKEN_IN_SPACINGS = 0.9  # a place is taken where a particle is nearer: they would push each other apart at once
+SHEET_PLAY_IN_SPACINGS = 0.05  # how much nearer to a sheet than at rest a block may start, whose lattice lies anywhere
 NO_POINTS = np.empty((0, 3))
 FULL_DOMAIN = 1.1  # particles that a domain holds at most over those that fill it at rest; emitters stop there
 ROUNDING = 1.0e-3  # of the clearance: lattice points are float32, and the first layer on a body is exactly that far
@@ -41,12 +42,12 @@ def fill_fluids(
     fluids: Sequence[FluidParameters],
     domain: DomainParameters,
     solids: Sequence[Solid],
-    pipes: NDArray[np.floating] = NO_POINTS,
+    sheets: NDArray[np.floating] = NO_POINTS,
 ) -> FluidFilling:
     """Fill the blocks of all fluids on lattices of spacing 2r, clear of walls, solids and each other.
 
     A place in two blocks belongs to the first, of the first fluid that has it.
-    Fluid keeps its distance from the boundary samples of pipes and sheets [m], (m, 3), too.
+    Fluid keeps its distance from the boundary samples of sheets [m], (m, 3), too.
 
     Raises:
         ShapeError: a block's shape cannot be built.
@@ -59,9 +60,9 @@ def fill_fluids(
         for number, block in enumerate(fluid.block):
             points = fill_with_particles(build_solid(block), spacing, lower=domain.min, upper=domain.max)
             points = free_places(points, spacing, solids, np.concatenate(positions))
-            if len(pipes) and len(points):
-                clearance = pipe_clearance(fluid.support_in_spacings) * spacing
-                points = points[cKDTree(pipes).query(points)[0] > clearance]
+            if len(sheets) and len(points):
+                clearance = _sheet_clearance(fluid.support_in_spacings) * spacing
+                points = points[cKDTree(sheets).query(points)[0] > clearance]
             if len(points) == 0:
                 raise ValueError(
                     f'fluid "{fluid.name}" block[{number}] has no particle: '
@@ -86,6 +87,13 @@ def free_places(
     return points
 
 
+def _sheet_clearance(support_in_spacings: float) -> float:
+    """Least distance of a fluid's particles from the samples of a sheet at the start [spacings]."""
+    from sim.fluid.kernels import wall_calibration  # loads Taichi, which checks of a job do without
+
+    return wall_calibration(support_in_spacings).standoff_in_spacings - SHEET_PLAY_IN_SPACINGS
+
+
 def particle_capacity(
     fluids: Sequence[FluidParameters], domain: DomainParameters, filling: FluidFilling, particle_volume: float
 ) -> int:
@@ -93,7 +101,7 @@ def particle_capacity(
     counts = np.bincount(filling.phase, minlength=len(fluids))
     most = counts.astype(np.float64)
     for number, opening in openings_of(fluids, particle_volume):
-        most[number] += opening.total_particles()
+        most[number] += opening.total_particles
     caps = [math.inf if fluid.max_particles is None else fluid.max_particles for fluid in fluids]
     total = float(np.maximum(counts, np.minimum(most, caps)).sum())
     full = FULL_DOMAIN * math.prod(np.subtract(domain.max, domain.min)) / particle_volume

@@ -304,11 +304,13 @@ class SPHFluid(ABC):
 
 def _expected_speed(start: FluidStart, stress: float) -> float:
     """Largest speed to expect [m/s] of the particles at the start, of those that will flow in, and of bodies."""
-    openings = [opening for _, opening in openings_of(start.fluids)]
-    inflow = [np.broadcast_to(opening.velocity, opening.points.shape) for opening in openings]
+    openings = [opening for _, opening in openings_of(start.fluids, bodies=start.followed)]
+    points, velocities = zip(
+        (start.positions, start.velocities), *(opening.outflow(start.body_speed) for opening in openings), strict=True
+    )
     return expected_speed(
-        np.concatenate([start.positions, *(opening.points for opening in openings)]),
-        np.concatenate([start.velocities, *inflow]),
+        np.concatenate(points),
+        np.concatenate(velocities),
         start.domain,
         start.gravity,
         cohesion_stress=stress,

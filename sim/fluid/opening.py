@@ -1,4 +1,4 @@
-"""The openings of emitters: the layers of particles in them, the pipes around their nozzles, and what is in the way."""
+"""The openings of emitters: the layers of particles in them, where these leave, and what is in the way."""
 
 from __future__ import annotations
 
@@ -12,183 +12,237 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.parameters import DiscOpening
+from sim.core.motion import rotation
+from sim.core.motion.paths import KeyframePath, Motion, path_through
+from sim.fluid.parameters import DiscOpening, RectangleOpening
+from sim.shapes.section import Section, section_of
 
 if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
+    from sim.fluid.inflow import Inflow
     from sim.fluid.parameters import EmitterParameters, FluidParameters
+    from sim.shapes.parameters import Placement
     from sim.shapes.solid import Solid
 
 NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35  # of particles and of layers: nearer, they would burst out
-PIPE_PLAY_IN_SPACINGS = 0.05  # how much nearer to a pipe than at rest a block may start, whose lattice lies anywhere
-LATTICES_TRIED = 41  # lattice constants between 0.9 and 1.1 spacings that are tried for a disc
-CELL_MISMATCH = 0.05  # by how much the area of a disc and that of the lattice cells in it may differ
+LATTICE_CONSTANTS = 1.1, 0.9  # spacings of lattices that are cut to an opening [spacings], largest and smallest
+LATTICES_TRIED = 41  # of them
+SAME_IN_SPACINGS = 1.0e-3  # openings whose particles differ by less are one
+MOUTH_IN_SPACINGS = 0.75  # how far from a place in an opening samples of a wall are in its mouth
+MANY = 2**53  # particles or layers that no emitter comes to
 
-SAME_IN_SPACINGS = 1.0e-3  # nozzles whose particles, and whose sides, differ by less are one
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Opening:
-    """A layer of particles in an opening, from which one layer after the other moves off."""
+    """An opening, from which layers of particles leave one after the other.
 
-    centre: NDArray[np.float64]  # of the opening [m], (3,)
-    axes: tuple[NDArray[np.float64], NDArray[np.float64]]  # unit vectors along its sides, (3,) each
-    half_size: tuple[float, float]  # half the lengths of the sides of what a layer fills, or twice its radius [m]
-    is_round: bool  # it is a disc
-    points: NDArray[np.float64]  # centres of the particles of a layer as it is in the opening [m], (n, 3)
-    velocity: NDArray[np.float64]  # of the inflow [m/s], (3,)
+    Its axes are two across the flow and the direction of that, in the world, or along those of the body that it
+    follows. A layer leaves when the fluid has come as far as the layer is thick, and its volume is just outside then.
+    """
+
+    centre: NDArray[np.float64]  # [m], (3,)
+    axes: NDArray[np.float64]  # unit vectors in rows, the last is where the fluid flows, (3, 3)
+    places: NDArray[np.float64]  # of the particles of a layer, along the first two axes [m], (n, 2)
+    half_size: tuple[float, float]  # half the sides of a box around what a layer fills, along these axes [m]
     layer_distance: float  # a layer's volume over the opening's area [m], so that the flow is exactly speed times area
-    support_in_spacings: float  # support radius of the fluid's kernel
-    start_s: float  # when the first layer leaves [s]
-    end_s: float  # no layer leaves from then on [s]
+    inflow: Inflow  # how far the fluid has come at each time
+    path: KeyframePath | None  # of its centre, where it has keyframes
+    follow: str | None  # name of the moving body that it is fixed to
+    placement: Motion  # of that body at the start; the world's origin at rest where there is none
 
     @classmethod
     def of(
-        cls, emitter: EmitterParameters, spacing: float, particle_volume: float, support_in_spacings: float
+        cls,
+        emitter: EmitterParameters,
+        spacing: float,
+        particle_volume: float,
+        body: Placement | None = None,
     ) -> Opening:
-        """The opening of an emitter, for particles of this spacing [m] and volume [m³].
+        """The opening of an emitter, on a body if it follows one, for particles of a spacing [m] and volume [m³].
 
         Raises:
-            ValueError: it is too narrow for them.
+            ValueError: it is too narrow for them; as a ShapeError where its shape cannot be built.
         """
-        direction = np.array(emitter.direction, dtype=np.float64)
-        direction /= np.linalg.norm(direction)
         layer = _best_layer(emitter, spacing, particle_volume)
         if layer is None:
             raise ValueError(
                 f"is too narrow for particles {spacing:g} m apart; enlarge it or use a smaller particle_radius"
             )
-        axes, (places, distance) = _axes_across(direction), layer
-        # A particle begins half a layer in front of the opening: its volume is then wholly inside the domain.
-        centre = np.array(emitter.position, dtype=np.float64)
-        points = centre + 0.5 * distance * direction + places @ np.stack(axes)
+        places, distance = layer
+        axes = rotation.rotated(rotation.from_degrees(emitter.rotation_deg), _axes_along(emitter.direction))
+        path = None
+        if emitter.keyframe:
+            path = path_through(emitter.keyframe, linear=emitter.interpolation == "linear")
+            axes = _axes_along(emitter.direction)
         return cls(
-            centre=centre,
+            centre=np.zeros(3) if path is not None else np.array(emitter.position, dtype=np.float64),
             axes=axes,
+            places=places,
             half_size=_half_size(emitter, places, spacing),
-            is_round=isinstance(emitter.shape, DiscOpening),
-            points=points,
-            velocity=emitter.speed * direction,
             layer_distance=distance,
-            support_in_spacings=support_in_spacings,
-            start_s=emitter.start_s,
-            end_s=math.inf if emitter.end_s is None else emitter.end_s,
+            inflow=emitter.inflow,
+            path=path,
+            follow=emitter.follow,
+            placement=_motion_of(body),
         )
 
     @property
+    def moves(self) -> bool:
+        """Whether it may be elsewhere later."""
+        return self.path is not None or self.follow is not None
+
+    @property
     def speed(self) -> float:
-        """Of the inflow [m/s]."""
-        return float(np.linalg.norm(self.velocity))
+        """Largest of the inflow [m/s], relative to the opening."""
+        return self.inflow.largest_speed
 
     @property
-    def direction(self) -> NDArray[np.float64]:
-        """Unit vector along the inflow, (3,)."""
-        return self.velocity / self.speed
+    def start_s(self) -> float:
+        """When it begins to emit [s]."""
+        return self.inflow.start_s
 
     @property
-    def nozzle_layers(self) -> int:
-        """Layers in the nozzle, where particles move at the speed of the inflow, whatever pushes.
-
-        They are a support radius deep: a particle that leaves has a whole lattice behind it.
-        """
-        return math.ceil(self.support_in_spacings)
+    def end_s(self) -> float:
+        """When it stops [s]; infinite if never."""
+        return self.inflow.end_s
 
     @property
-    def nozzle_depth(self) -> float:
-        """Length of the nozzle along the inflow [m]."""
-        return self.nozzle_layers * self.layer_distance
-
-    @property
-    def drained_s(self) -> float:
-        """When the nozzle becomes empty [s]."""
-        return self.end_s + self.nozzle_depth / self.speed
-
-    def nozzle_places(self) -> NDArray[np.float64]:
-        """Where particles are in the full nozzle as its last layer leaves the opening [m], (m, 3)."""
-        moved = np.arange(self.nozzle_layers) * self.layer_distance
-        return (self.points[None] + moved[:, None, None] * self.direction).reshape(-1, 3)
-
-    def distance_to_nozzle(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Distance of points (m, 3) from the space that the full nozzle fills [m], (m,); 0 in it."""
-        from_centre = points - self.centre
-        along = from_centre @ self.direction
-        across = np.abs(np.stack([from_centre @ axis for axis in self.axes]))
-        if self.is_round:
-            outside = np.maximum(np.hypot(*across) - self.half_size[0], 0.0)
-        else:
-            outside = np.hypot(*np.maximum(across - np.array(self.half_size)[:, None], 0.0))
-        return np.hypot(outside, np.maximum(np.maximum(-along, along - self.nozzle_depth), 0.0))
-
-    def pipe(self, spacing: float) -> NDArray[np.float64]:
-        """Boundary samples of a short pipe around the nozzle [m], (m, 3).
-
-        It keeps surrounding fluid from flowing into the gap that opens behind a layer before the next one fills it.
-        The samples are as far outside of the nozzle as those of a wall that touches the fluid. They push, and exert no
-        friction (`is_felt_in_nozzles`).
-        """
-        depths = np.arange(0.0, self.nozzle_depth, spacing)
-        outside = (_wall_standoff(self.support_in_spacings) - 0.5) * spacing
-        rim = _rim(tuple(half + outside for half in self.half_size), self.is_round, spacing)
-        around = self.centre + rim @ np.stack(self.axes)
-        return (around[None] + depths[:, None, None] * self.direction).reshape(-1, 3)
-
-    def layers_due(self, time_s: float) -> int:
-        """Layers that have left the opening by a time [s]."""
-        if time_s < self.start_s:
-            return 0
-        # The last layer is the last that leaves before the end, which is no time of an emission itself.
-        passed = (min(time_s, self.end_s) - self.start_s) * self.speed / self.layer_distance
-        return math.ceil(passed * (1.0 - 1.0e-12)) if time_s >= self.end_s else math.floor(passed) + 1
-
-    def layer_at(self, layer: int, time_s: float) -> NDArray[np.float64]:
-        """Where the particles of a layer are that has moved on freely since it left [m], (n, 3)."""
-        moved_s = time_s - self.start_s - layer * self.layer_distance / self.speed
-        return self.points + moved_s * self.velocity
-
     def total_particles(self) -> float:
         """Particles of all its layers; infinite where it never ends."""
-        return math.inf if math.isinf(self.end_s) else float(len(self.points) * self.layers_due(self.end_s))
+        travel = self.inflow.total_travel
+        return math.inf if math.isinf(travel) else float(round(travel / self.layer_distance * len(self.places)))
+
+    def layers_due(self, time_s: float) -> int:
+        """Layers that have left the opening by a time [s]: all, to a particle, at its end, and whole ones before."""
+        total = min(self.total_particles, MANY)
+        if time_s >= self.end_s:
+            return math.ceil(total / len(self.places))
+        passed = self.inflow.travel_at(time_s) / self.layer_distance * (1.0 + 1.0e-12)
+        # The first layer is what is left of the particles when all others are whole.
+        return math.floor(passed + 1.0 - self.count_of(0) / len(self.places))
+
+    def count_of(self, layer: int) -> int:
+        """Particles of a layer; the first has fewer where all of them are no whole number of layers."""
+        whole, total = len(self.places), self.total_particles
+        if layer > 0 or math.isinf(total) or total == 0.0:
+            return whole
+        return int(total - 1) % whole + 1
+
+    def leaves_at(self, layer: int) -> float:
+        """Time when a layer leaves [s]."""
+        passed = layer + self.count_of(0) / len(self.places)
+        return min(self.inflow.time_of(passed * self.layer_distance), self.end_s)
+
+    def places_of(self, layer: int) -> NDArray[np.float64]:
+        """Where particles of a layer are as it leaves, along all axes from the centre [m], (m, 3)."""
+        count, whole = self.count_of(layer), len(self.places)
+        chosen = self.places[(np.arange(count) * whole + whole // 2) // count % whole] if count < whole else self.places
+        # Half a layer in front of the opening: its volume is then wholly outside.
+        return np.pad(chosen, ((0, 0), (0, 1)), constant_values=0.5 * self.layer_distance)
+
+    def motion(self, time_s: float, body: Motion | None = None) -> Motion:
+        """Pose of the body or the path that carries it at a time [s]; the body's own at the start if not given."""
+        if self.path is not None:
+            return self.path.at(time_s)
+        return self.placement if body is None else body
+
+    def points(self, layer: int = 0, time_s: float = 0.0, body: Motion | None = None) -> NDArray[np.float64]:
+        """Where particles of a layer are in the world as it leaves at a time [s] [m], (m, 3)."""
+        return self.to_world(self.places_of(layer), self.motion(time_s, body))
+
+    def to_world(self, own: NDArray[np.float64], carrier: Motion) -> NDArray[np.float64]:
+        """Points along its axes from its centre, in the world [m], (m, 3)."""
+        return carrier.position + rotation.rotated(carrier.orientation, self.centre + own @ self.axes)
+
+    def to_own(self, points: NDArray[np.floating], carrier: Motion) -> NDArray[np.float64]:
+        """Points of the world along its axes from its centre [m], (m, 3)."""
+        unturned = rotation.rotated(rotation.conjugate(carrier.orientation), points - carrier.position)
+        return (unturned - self.centre) @ self.axes.T
+
+    def direction(self, carrier: Motion) -> NDArray[np.float64]:
+        """Unit vector along the inflow in the world, (3,)."""
+        return rotation.rotated(carrier.orientation, self.axes[2])
+
+    def velocity_at(self, points: NDArray[np.float64], carrier: Motion, speed: float) -> NDArray[np.float64]:
+        """Velocity of what flows out at points of the world at a speed [m/s], (m, 3) [m/s]."""
+        arms = points - carrier.position
+        return carrier.velocity + rotation.cross(carrier.angular_velocity, arms) + speed * self.direction(carrier)
+
+    def outflow(self, body_speed: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places where fluid flows out [m], (m, 3), and velocities as large as they may get there [m/s], (m, 3).
+
+        They are at the start, and at each keyframe; a body that it follows may have a speed of its own [m/s].
+        """
+        motions, carried = [self.placement], body_speed if self.follow is not None else 0.0
+        if self.path is not None:
+            motions = [self.path.at(float(time)) for time in self.path.times]
+            carried = self.path.largest_speed(float(np.hypot(*self.half_size)))
+        points = np.concatenate([self.to_world(self.places_of(1), motion) for motion in motions])
+        velocity = (self.speed + carried) * self.direction(motions[0])
+        return points, np.broadcast_to(velocity, points.shape)
+
+    def is_behind(self, points: NDArray[np.floating], carrier: Motion, spacing: float, depth: float) -> NDArray[np.bool_]:
+        """Which points of the world [m], (m, 3), are in its mouth or behind it, down to a depth [m], (m,)."""
+        own = self.to_own(points, carrier)
+        nearest, _ = cKDTree(self.places).query(own[:, :2], distance_upper_bound=MOUTH_IN_SPACINGS * spacing)
+        return np.isfinite(nearest) & (own[:, 2] > -depth) & (own[:, 2] < 0.0)
 
 
-def openings_of(fluids: Sequence[FluidParameters], particle_volume: float | None = None) -> list[tuple[int, Opening]]:
+def openings_of(
+    fluids: Sequence[FluidParameters],
+    particle_volume: float | None = None,
+    bodies: Mapping[str, Placement] | None = None,
+) -> list[tuple[int, Opening]]:
     """Number of its fluid and opening of each emitter, for particles of a volume [m³]; that of the lattice if omitted.
+
+    The bodies that emitters follow stand by name.
 
     Raises:
         ValueError: one is too narrow.
     """
     return [
-        (number, Opening.of(emitter, fluid.spacing, particle_volume or fluid.lattice_volume, fluid.support_in_spacings))
+        (number, Opening.of(emitter, fluid.spacing, particle_volume or fluid.lattice_volume, followed(emitter, bodies)))
         for number, fluid in enumerate(fluids)
         for emitter in fluid.emitter
     ]
 
 
-def pipe_clearance(support_in_spacings: float) -> float:
-    """Least distance of a fluid's particles from the samples of a pipe at the start [spacings]."""
-    return _wall_standoff(support_in_spacings) - PIPE_PLAY_IN_SPACINGS
+def followed(emitter: EmitterParameters, bodies: Mapping[str, Placement] | None) -> Placement | None:
+    """The body that an emitter follows, of those by name; None if there is none."""
+    return None if emitter.follow is None or bodies is None else bodies.get(emitter.follow)
+
+
+def placed_on(emitter: EmitterParameters, body: Placement) -> EmitterParameters:
+    """The emitter where it is in the world with a body that stands still."""
+    turned, own = rotation.from_degrees(body.rotation_deg), rotation.from_degrees(emitter.rotation_deg)
+    position = np.asarray(body.position) + rotation.rotated(turned, np.asarray(emitter.position))
+    update = {"position": tuple(position.tolist()), "rotation_deg": rotation.to_degrees(rotation.product(turned, own))}
+    return emitter.model_copy(update={**update, "follow": None})
 
 
 def obstruction(opening: Opening, spacing: float, domain: DomainParameters, solids: Sequence[Solid]) -> str | None:
     """Why fluid cannot enter here, or None: particles of the opening outside the domain, or in a solid."""
-    outside = ((opening.points < domain.min) | (opening.points > domain.max)).any(axis=1)
+    points = opening.points(1, opening.start_s)
+    outside = ((points < domain.min) | (points > domain.max)).any(axis=1)
     if outside.any():
         return (
             f"{np.count_nonzero(outside)} of the {len(outside)} places of its opening are outside the domain; "
             "move it in, or let it point inwards"
         )
-    inside = np.zeros(len(opening.points), dtype=bool)
+    inside = np.zeros(len(points), dtype=bool)
     for solid in solids:
-        inside |= solid.signed_distance(opening.points) < 0.25 * spacing
+        inside |= solid.signed_distance(points) < 0.25 * spacing
     if inside.any():
         return f"{np.count_nonzero(inside)} of the {len(inside)} places of its opening are in a solid body; move it out"
     return None
 
 
-def _wall_standoff(support_in_spacings: float) -> float:
-    """Distance from samples at which fluid is at rest [spacings]."""
-    from sim.fluid.kernels import wall_calibration  # loads Taichi, which most checks of a job do without
-
-    return wall_calibration(support_in_spacings).standoff_in_spacings
+def _motion_of(body: Placement | None) -> Motion:
+    """A body's pose at the start, at rest; the world's own where there is none."""
+    if body is None:
+        return Motion(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+    orientation = rotation.from_degrees(body.rotation_deg)
+    return Motion(np.array(body.position, dtype=np.float64), orientation, np.zeros(3), np.zeros(3))
 
 
 def _best_layer(
@@ -198,11 +252,13 @@ def _best_layer(
 
     None where all are too near or too far.
     """
-    shape = emitter.shape
-    if isinstance(shape, DiscOpening):
-        layers, area = _disc_layers(shape.radius, spacing), math.pi * shape.radius**2
+    shape, area = emitter.shape, emitter.area
+    if isinstance(shape, RectangleOpening):
+        layers = _rectangle_layers(shape.size, spacing)
+    elif isinstance(shape, DiscOpening):
+        layers = _cut_layers(_disc(shape.radius), area, spacing)
     else:
-        layers, area = _rectangle_layers(shape.size, spacing), shape.size[0] * shape.size[1]
+        layers = _cut_layers(section_of(shape), area, spacing)
     best, farthest = None, 0.0
     for places, nearest in layers:
         distance = len(places) * particle_volume / area
@@ -222,85 +278,68 @@ def _rectangle_layers(sides: tuple[float, float], spacing: float) -> Iterator[tu
         yield np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2), min(gaps, default=math.inf)
 
 
-def _disc_layers(radius: float, spacing: float) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """Square lattices cut out of a disc, around one of their points or between four, and their spacing."""
-    for shift in (0.0, 0.5):
-        for constant in np.linspace(0.9, 1.1, LATTICES_TRIED) * spacing:
-            reach = math.ceil(radius / constant) + 1
-            axis = (np.arange(-reach, reach + 1) + shift) * constant
-            points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-            points = points[np.hypot(points[:, 0], points[:, 1]) <= radius]
-            # Its cells have to fill the disc, or the jet would be denser or thinner than the fluid.
-            if len(points) and abs(math.log(len(points) * constant**2 / (math.pi * radius**2))) < CELL_MISMATCH:
-                yield points, float(constant) if len(points) > 1 else math.inf
+def _cut_layers(section: Section, area: float, spacing: float) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """Square lattices cut out of a section of an area [m²], around one of their points or between four, and spacings.
+
+    Their cells have exactly that area in all: the jet would be denser or thinner than the fluid otherwise.
+    """
+    fewest, most = (math.ceil(area / (limit * spacing) ** 2) for limit in LATTICE_CONSTANTS)
+    counts = np.unique(np.linspace(max(fewest, 1), max(most, 1), LATTICES_TRIED).round().astype(int))
+    for count, *shift in product(counts, (0.0, 0.5), (0.0, 0.5)):
+        constant = math.sqrt(area / count)
+        reach = np.ceil(section.half_size / constant).astype(int) + 1
+        x, y = ((np.arange(-end, end + 1) + own) * constant for end, own in zip(reach, shift, strict=True))
+        points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        depth = section.depth(points)
+        order = np.argsort(-depth, kind="stable")
+        last, next_ = depth[order[count - 1]], depth[order[count]]
+        # Those at one depth, such as four around the middle of a disc, belong together.
+        if last >= 0.0 and last - next_ > SAME_IN_SPACINGS * spacing:
+            yield points[np.sort(order[:count])], constant if count > 1 else math.inf
+
+
+def _disc(radius: float) -> Section:
+    return Section(np.full(2, radius), lambda points: radius - np.hypot(points[:, 0], points[:, 1]), math.pi * radius**2)
 
 
 def _half_size(emitter: EmitterParameters, places: NDArray[np.float64], spacing: float) -> tuple[float, float]:
-    shape = emitter.shape
-    if isinstance(shape, DiscOpening):
-        # The outermost particles of a disc may lie nearer to its edge, or farther from it, than half a spacing.
-        radius = float(np.hypot(places[:, 0], places[:, 1]).max()) + 0.5 * spacing
-        return radius, radius
-    return 0.5 * shape.size[0], 0.5 * shape.size[1]
+    if isinstance(emitter.shape, RectangleOpening):
+        return 0.5 * emitter.shape.size[0], 0.5 * emitter.shape.size[1]
+    # The outermost particles of a lattice that is cut may lie nearer to the edge, or farther, than half a spacing.
+    first, second = np.abs(places).max(axis=0) + 0.5 * spacing
+    return float(first), float(second)
 
 
-def _rim(half_size: tuple[float, ...], is_round: bool, spacing: float) -> NDArray[np.float64]:
-    """Points along a circle or the sides of a rectangle, about a spacing apart [m], (n, 2)."""
-    if is_round:
-        angle = np.linspace(0.0, 2.0 * np.pi, math.ceil(2.0 * np.pi * half_size[0] / spacing), endpoint=False)
-        return half_size[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    counts = [math.ceil(2.0 * half / spacing) for half in half_size]
-    x, y = (half * np.linspace(-1.0, 1.0, count, endpoint=False) for half, count in zip(half_size, counts, strict=True))
-    along_x, along_y = np.stack([x, np.full_like(x, -half_size[1])], 1), np.stack([np.full_like(y, half_size[0]), y], 1)
-    return np.concatenate([along_x, along_y, -along_x, -along_y])
-
-
-def _axes_across(direction: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two unit vectors across a direction; the first is horizontal."""
-    sideways = np.cross([0.0, 0.0, 1.0], direction)
+def _axes_along(direction: Sequence[float]) -> NDArray[np.float64]:
+    """Two unit vectors across a direction, the first of them horizontal, and one along it, in rows, (3, 3)."""
+    along = np.array(direction, dtype=np.float64) / np.linalg.norm(direction)
+    sideways = np.cross([0.0, 0.0, 1.0], along)
     if np.linalg.norm(sideways) < 1.0e-6:
         sideways = np.array([0.0, 1.0, 0.0])
     first = sideways / np.linalg.norm(sideways)
-    return first, np.cross(direction, first)
+    return np.stack([first, np.cross(along, first), along])
 
 
-def is_same_nozzle(one: Opening, other: Opening, spacing: float) -> bool:
-    """Whether two emitters have one opening and one pipe, as when an inflow changes its speed."""
-
-    def is_equal(own: object, others: object) -> bool:
-        return bool(np.allclose(own, others, rtol=0.0, atol=SAME_IN_SPACINGS * spacing))  # type: ignore[arg-type]
-
+def is_same_opening(one: Opening, other: Opening, spacing: float) -> bool:
+    """Whether two emitters have one opening that rests, as when an inflow changes its speed."""
     return (
-        one.is_round == other.is_round
-        and one.points.shape == other.points.shape
-        and is_equal(one.points, other.points)
-        and is_equal(one.half_size, other.half_size)
-        and is_equal(spacing * one.direction, spacing * other.direction)
+        not (one.moves or other.moves)
+        and one.places.shape == other.places.shape
+        and bool(np.allclose(one.points(1), other.points(1), rtol=0.0, atol=SAME_IN_SPACINGS * spacing))
     )
 
 
-def nozzle_collision(one: Opening, other: Opening, name: str, spacing: float) -> str | None:
+def opening_collision(one: Opening, other: Opening, name: str, spacing: float) -> str | None:
     """Why an emitter cannot be in one tank with another one, of this name, or None.
 
-    Particles of one nozzle must not be where those of the other are at the same time, as nothing would push them apart,
-    and not at its pipe, which stays when its emitter has ended.
+    Layers that leave one must not be where those of the other do at the same time, as they would take their places.
     """
-    if is_same_nozzle(one, other, spacing):
-        if one.start_s < other.end_s and other.start_s < one.end_s:
-            return f"is the same opening as {name}, at the same time; let one start when the other has ended"
+    if one.moves or other.moves or one.start_s >= other.end_s or other.start_s >= one.end_s:
         return None
-    places, others_places = one.nozzle_places(), other.nozzle_places()
-    if one.start_s < other.drained_s and other.start_s < one.drained_s:
-        nearest = _least_distance(places, others_places)
-        if nearest < NEAREST_IN_SPACINGS * spacing:
-            return f"its nozzle overlaps that of {name}, at the same time; move one of them"
-    clearance = pipe_clearance(one.support_in_spacings) * spacing
-    nearest = min(_least_distance(places, other.pipe(spacing)), _least_distance(others_places, one.pipe(spacing)))
-    if nearest < clearance:
-        return (
-            f"its nozzle and that of {name} are so near that the pipe around one is in the way of the other; "
-            f"move them apart by {clearance - nearest:.2g} m at least"
-        )
+    if is_same_opening(one, other, spacing):
+        return f"is the same opening as {name}, at the same time; let one start when the other has ended"
+    if float(cKDTree(one.points(1)).query(other.points(1))[0].min()) < NEAREST_IN_SPACINGS * spacing:
+        return f"its opening overlaps that of {name}, at the same time; move one of them"
     return None
 
 
@@ -313,38 +352,9 @@ def opening_problem(
 ) -> str | None:
     """Why an opening cannot be where it is, or None: it is not free, or in the way of an earlier one.
 
-    The earlier ones are named as messages call them.
+    The earlier ones are named as messages call them. Of one that moves only the start counts, if it is on a path.
     """
-    reason = obstruction(opening, spacing, domain, solids)
+    reason = None if opening.follow is not None else obstruction(opening, spacing, domain, solids)
     for name, other in earlier.items():
-        reason = reason or nozzle_collision(opening, other, name, spacing)
+        reason = reason or opening_collision(opening, other, name, spacing)
     return reason
-
-
-def pipes(openings: Sequence[Opening], spacing: float) -> list[NDArray[np.float64]]:
-    """Boundary samples of the pipes of all openings [m], (m_k, 3) each; emitters with one nozzle share its pipe."""
-    return [
-        opening.pipe(spacing)
-        for number, opening in enumerate(openings)
-        if not any(is_same_nozzle(opening, earlier, spacing) for earlier in openings[:number])
-    ]
-
-
-def is_felt_in_nozzles(
-    positions: NDArray[np.floating], openings: Sequence[Opening], support_radius: float
-) -> NDArray[np.bool_]:
-    """Whether particles in any of the nozzles may feel a sample at one of these positions [m], (m, 3); (m,).
-
-    Such samples, of pipes and of walls and bodies at rest that an opening lies in, exert no friction. A nozzle gives
-    its particles their velocity once a step, but within it they are unknowns of the viscosity as all others are: held
-    by samples at rest, they would brake the jet that they push.
-    """
-    felt = np.zeros(len(positions), dtype=np.bool_)
-    for opening in openings:
-        felt |= opening.distance_to_nozzle(positions) < support_radius
-    return felt
-
-
-def _least_distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """From a point of one set to a point of the other [m]."""
-    return float(cKDTree(one).query(other)[0].min())

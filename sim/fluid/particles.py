@@ -37,9 +37,8 @@ class Layer(NamedTuple):
     """Particles that may come, (n,) each."""
 
     places: Vectors  # where they are [m]
+    velocities: Vectors  # [m/s]
     count: ti.i32
-    moved: ti.math.vec3  # how far all of them have moved from there [m]
-    velocity: ti.math.vec3  # of all of them [m/s]
     phase: ti.i32  # number of their fluid
     free: Integers  # 1 for the places to take, else 0
     order: Integers  # number of taken places before each, (n + 1,)
@@ -181,8 +180,8 @@ def append_particles(layer: Layer, particles: Particles):
     for k in range(layer.count):
         if layer.free[k] != 0:
             i = particles.count + layer.order[k]
-            particles.position[i] = layer.places[k] + layer.moved
-            particles.velocity[i] = layer.velocity
+            particles.position[i] = layer.places[k]
+            particles.velocity[i] = layer.velocities[k]
             particles.particle_id[i] = layer.first_id + layer.order[k]
             particles.phase[i] = layer.phase
 

@@ -11,16 +11,17 @@ import taichi as ti
 from sim.core.cells import CellGrid
 from sim.core.neighbors import cells_per_radius
 from sim.fluid.body_forces import BodyForces
-from sim.fluid.boundary import BodyStates, Boundary
+from sim.fluid.boundary import STATE_WIDTH, BodyStates, Boundary, states_of
 from sim.fluid.boundary_akinci2012 import BoundarySamples
-from sim.fluid.emitter import Emission
+from sim.fluid.emitter import Carrier, Emission
 from sim.fluid.kernels import Discretization
-from sim.fluid.opening import is_felt_in_nozzles
 from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
 from sim.fluid.sheets import SheetForces
 from sim.fluid.stepping import MotionSummary, ParticleStepper, box_of
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from sim.core.domain import DomainParameters
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from sim.fluid.parameters import FluidParameters
     from sim.fluid.particles import Phases
     from sim.fluid.sheets import SheetSamples
+    from sim.shapes.parameters import Placement
 
 
 MEASURES = ("max_speed", "max_acceleration", "max_frequency", "max_displacement")  # of the last step, in a checkpoint
@@ -49,6 +51,8 @@ class FluidStart:
     sheets: SheetSamples | None = None
     body_count: int = 0  # moving bodies
     body_speed: float = 0.0  # largest speed of them to expect [m/s]
+    followed: Mapping[str, Placement] = field(default_factory=dict)  # moving bodies that emitters follow, at the start
+    carriers: Mapping[str, Carrier] = field(default_factory=dict)  # and which of the moving bodies they are
     capacity: int | None = None  # most particles that there can ever be; those at the start if omitted
 
 
@@ -97,17 +101,27 @@ class ParticleTank:
         self._search_radius = (1.0 + skin) * discretization.support_radius
         reach, domain = cells_per_radius(discretization.support_in_spacings), start.domain
         self.grid = CellGrid.covering(np.array(domain.min), np.array(domain.max), self._search_radius, reach=reach)
-        self.emission = Emission(start.fluids, discretization, self.grid)
-        support = discretization.support_radius
+        self.emission = Emission(
+            start.fluids,
+            discretization,
+            self.grid,
+            domain,
+            start.gravity,
+            bodies=start.followed,
+            carriers=start.carriers,
+        )
+        fixed, moving = self.emission.open_mouths(start.boundary, start.moving)
+        pistons = self.emission.piston_samples()
         self.boundary = Boundary(
-            start.boundary,
-            start.moving,
-            is_smooth=is_felt_in_nozzles(start.boundary.positions, self.emission.openings, support),
+            fixed,
+            moving.with_bodies(pistons, first=start.body_count),
+            is_smooth=self.emission.is_felt(start.boundary.positions),
             sheets=BoundarySamples.of_bodies() if start.sheets is None else start.sheets.boundary,
-            body_count=start.body_count,
+            body_count=start.body_count + len(pistons),
             grid=self.grid,
             discretization=discretization,
         )
+        self._bodies = states_of(np.zeros(start.body_count * STATE_WIDTH))
         self.body_forces = BodyForces(self.boundary, self.grid, self._search_radius)
         count = len(start.positions)
         capacity = max(start.capacity or 0, count)
@@ -133,6 +147,8 @@ class ParticleTank:
         )
         self.last_speed = float(np.sqrt((np.asarray(start.velocities, np.float64) ** 2).sum(axis=1).max(initial=0.0)))
         self.motion = MotionSummary(self.last_speed, float(np.linalg.norm(start.gravity)))
+        self.emission.carry(self._bodies)
+        self._place_bodies()
         self._expect_inflow()
         self.begin_frame()
         self.find_neighbors()
@@ -157,9 +173,12 @@ class ParticleTank:
 
     def move_bodies(self, states: BodyStates, *, elapsed_s: float) -> None:
         """Put the moving bodies where they are; 0 s have elapsed since the last time where they are put there anew."""
-        self._boundary_travelled += self.boundary.place(states)
+        # As a checkpoint holds them: a run that continues finds the same.
+        self._bodies = BodyStates(*(each.astype(np.float32).astype(np.float64) for each in states))
+        self.emission.carry(self._bodies)
+        self._place_bodies()
         spin = np.linalg.norm(states.angular_velocity, axis=1)
-        speed = np.linalg.norm(states.velocity, axis=1) + spin * self.boundary.reach
+        speed = np.linalg.norm(states.velocity, axis=1) + spin * self.boundary.reach[: len(spin)]
         self.body_speed = float(speed.max(initial=0.0))
         self._without_neighbors |= elapsed_s == 0.0
 
@@ -185,18 +204,19 @@ class ParticleTank:
         self.motion = replace(self.motion, max_speed=self.motion.max_speed + largest_change)
 
     def advance(self, acceleration: ti.Ndarray, dt: float, frequency_squared: ti.Ndarray | None = None) -> None:
-        """v_i += dt a_i, x_i += dt v_i, within the walls; then the emitters. In nozzles a_i becomes 0.
+        """v_i += dt a_i, x_i += dt v_i, within the walls; then the emitters.
 
         `frequency_squared` is that at which each particle can swing against its own pressure [1/s²].
         """
         particles = self.particles
-        self.emission.drive(particles, acceleration)
         self.motion = self._stepper.advance(
             particles.position, particles.velocity, acceleration, particles.count, dt, frequency_squared
         )
         emitted = self.emission.advance(particles, dt, self._next_particle_id)
         self._next_particle_id += emitted
         self._without_neighbors |= emitted > 0
+        if self.emission.openings:
+            self._place_bodies()
         self.last_speed = self.motion.max_speed
         self.peak_speed = max(self.peak_speed, self.motion.max_speed)
         self._expect_inflow()
@@ -278,6 +298,8 @@ class ParticleTank:
         self.removed = int(arrays["particles_removed"][0])
         self._next_particle_id = int(arrays["next_particle_id"][0])
         self.emission.restore(arrays)
+        self._bodies = states_of(arrays["body_states"].astype(np.float64)[: self._bodies.position.size // 3 * STATE_WIDTH])
+        self.emission.carry(self._bodies)
         self.peak_speed = self.motion.max_speed
         if self.body_forces.sheets is not None:
             self.body_forces.sheets.restore(arrays)
@@ -297,6 +319,11 @@ class ParticleTank:
                 raise ValueError(
                     f'checkpoint of "{name}": {key} must be {own.dtype} {shape}, got {found.dtype} {found.shape}'
                 )
+
+    def _place_bodies(self) -> None:
+        """Put the samples of moving bodies and of the emitters' pistons where these are."""
+        states = BodyStates(*map(np.concatenate, zip(self._bodies, self.emission.pistons(), strict=True)))
+        self._boundary_travelled += self.boundary.place(states)
 
     def _expect_inflow(self) -> None:
         """Let the next time step be right for what flows in during it."""

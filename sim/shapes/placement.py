@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.shapes.parameters import Placement, TorusShape
+from sim.shapes.parameters import Placement, Shape, TorusShape
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 from sim.shapes.sampling import sample_surface
 from sim.shapes.solid import Points, RestShape, ShapeError, TriangleMesh
@@ -83,7 +83,12 @@ def build_solid(placement: Placement) -> PlacedSolid:
     # Lower-case "xyz" are rotations about fixed world axes: R = Rz Ry Rx.
     rotation = Rotation.from_euler("xyz", placement.rotation_deg, degrees=True).as_matrix()
     position = np.asarray(placement.position, dtype=np.float64)
-    return PlacedSolid(_BUILDERS[placement.shape.type](placement.shape), placement.scale, rotation, position)
+    return PlacedSolid(build_rest_shape(placement.shape), placement.scale, rotation, position)
+
+
+def build_rest_shape(shape: Shape) -> RestShape:
+    """The shape about its own origin. Raises as `build_solid`."""
+    return _BUILDERS[shape.type](shape)
 
 
 def _build_torus(shape: TorusShape) -> Torus:

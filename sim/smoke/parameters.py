@@ -10,7 +10,12 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from sim.core.domain import DomainParameters, Face, Faces
-from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
+from sim.core.motion.parameters import (
+    KeyframeParameters,
+    RampPointParameters,
+    placed_at_first_keyframe,
+    require_ascending_times,
+)
 from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
 
@@ -19,13 +24,6 @@ MOST_CELLS = 2**30  # of one smoke, 1024 along each edge: a job with more is ref
 CELLS_PER_EDDY = 2.0  # eddies of gusts are at least so many cells wide: the grid carries nothing finer
 
 Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]
-
-
-class RampPointParameters(Parameters):
-    """How strong a source is at one time."""
-
-    time_s: NonNegative = Field(description="Time [s]; later than that of the point before.")
-    strength: Fraction = Field(description="Part of its density and of its heat that it has then [-].")
 
 
 class SmokeSourceParameters(Placement):
@@ -92,12 +90,7 @@ class SmokeSourceParameters(Placement):
             raise ValueError(
                 "interpolation has no meaning without keyframes; remove it or add [[smoke.source.keyframe]]"
             )
-        for number, (before, after) in enumerate(pairwise(self.ramp), start=1):
-            if after.time_s <= before.time_s:
-                raise ValueError(
-                    f"ramp[{number}].time_s must be after {before.time_s:g} s, that of the point before, "
-                    f"got {after.time_s:g} s"
-                )
+        require_ascending_times(self.ramp, "ramp")
         if "flicker_rate" in self.model_fields_set and not self.flicker:
             raise ValueError("flicker_rate has no meaning without flicker; remove it or give flicker")
         return self

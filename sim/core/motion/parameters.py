@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import Field
 
-from sim.core.parameters import NonNegative, Parameters, Vector3
+from sim.core.parameters import Fraction, NonNegative, Parameters, Vector3
 
 
 class KeyframeParameters(Parameters):
@@ -20,6 +20,16 @@ class KeyframeParameters(Parameters):
         default=(0.0, 0.0, 0.0),
         description="Rotation about x, then y, then z (world axes) [degrees]; "
         "the way from one keyframe to the next is the shortest, below 180 degrees.",
+    )
+
+
+class RampPointParameters(Parameters):
+    """How strong something that emits is at one time."""
+
+    time_s: NonNegative = Field(description="Time [s]; later than that of the point before.")
+    strength: Fraction = Field(
+        description="Part of its full strength that it has then [-]: of density and heat of a source of smoke, of the "
+        "speed of an emitter."
     )
 
 
@@ -48,11 +58,14 @@ def placed_at_first_keyframe(data: Any, what: str) -> Any:
     return {**data, **start}
 
 
-def require_ascending_times(keyframes: Sequence[KeyframeParameters]) -> None:
-    """Raises ValueError unless each keyframe is later than the one before."""
-    for number, (before, after) in enumerate(pairwise(keyframes), start=1):
+def require_ascending_times(
+    points: Sequence[KeyframeParameters] | Sequence[RampPointParameters], key: str = "keyframe"
+) -> None:
+    """Raises ValueError unless each point under a key is later than the one before."""
+    noun = "keyframe" if key == "keyframe" else "point"
+    for number, (before, after) in enumerate(pairwise(points), start=1):
         if after.time_s <= before.time_s:
             raise ValueError(
-                f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
+                f"{key}[{number}].time_s must be after {before.time_s:g} s, that of the {noun} before, "
                 f"got {after.time_s:g} s"
             )

@@ -130,6 +130,11 @@ class KeyframePath(Path):
         self._velocities = self._tangents(np.diff(positions, axis=0))
         self._angular_velocities = self._tangents(self._turns)
 
+    @property
+    def times(self) -> Array:
+        """Of its keyframes [s], (n,)."""
+        return self._times
+
     def at(self, time_s: float) -> Motion:
         """Its motion at a simulated time [s]."""
         if time_s < self._times[0] or time_s >= self._times[-1]:

@@ -83,6 +83,14 @@ def from_degrees(rotation_deg: tuple[float, float, float]) -> Array:
     return quaternion
 
 
+def to_degrees(q: Array) -> tuple[float, float, float]:
+    """Rotations about the world's x, then y, then z that make up a unit quaternion (4,) [degrees]."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z = Rotation.from_quat(q, scalar_first=True).as_euler("xyz", degrees=True).tolist()
+    return x, y, z
+
+
 def exponential(vector: Array) -> Array:
     """Unit quaternions of rotation vectors [rad], (..., 3): (..., 4)."""
     half = 0.5 * np.sqrt(np.square(vector).sum(axis=-1, keepdims=True))
