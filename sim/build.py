@@ -14,6 +14,7 @@ from sim.core.world import World
 from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
 from sim.coupling.cloth_fluid import ClothFluidCoupling, ClothSamples
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
+from sim.coupling.emitter_bodies import with_emitters_on
 from sim.coupling.fluid_rigid import FluidRigidCoupling, samples_of_moving_bodies
 from sim.coupling.smoke_cloth import SmokeClothCoupling
 from sim.coupling.smoke_fluid import SmokeFluidCoupling
@@ -24,7 +25,7 @@ from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, 
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.kernels import Discretization
 from sim.fluid.emitter import Carrier
-from sim.fluid.opening import Opening, opening_problem, openings_of, placed_on
+from sim.fluid.opening import Opening, opening_problem, openings_of
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
     from sim.core.domain import DomainParameters
     from sim.fluid.fluid import SPHFluid
-    from sim.fluid.parameters import EmitterParameters, FluidParameters
+    from sim.fluid.parameters import FluidParameters
     from sim.rigid.parameters import RigidBodyParameters
     from sim.scene import SceneParameters
     from sim.shapes.solid import Solid
@@ -105,7 +106,7 @@ def _build_fluids(
     volume = discretization.particle_volume
     movers = [body for body in scene.rigid if body.kind != "static"]
     solids = [*(body.solid for body in static), *(build_solid(body) for body in movers)]
-    fluids = fluids_with_emitters_on(scene.fluid, scene.rigid)
+    fluids = with_emitters_on(scene.fluid, scene.rigid)
     followed = {body.name: body for body in movers}
     _check_openings(fluids, scene, solids, followed, spacing, volume)
     filling = fill_fluids(fluids, scene.domain, solids, NO_POINTS if cloth is None else cloth.start)
@@ -141,32 +142,6 @@ def _build_fluids(
         capacity=particle_capacity(fluids, scene.domain, filling, volume),
     )
     return SOLVERS[scene.fluid[0].solver](start)
-
-
-def fluids_with_emitters_on(
-    fluids: Sequence[FluidParameters], bodies: Sequence[RigidBodyParameters]
-) -> tuple[FluidParameters, ...]:
-    """The fluids with their emitters on static bodies where these stand; only those on bodies that move still follow.
-
-    Raises:
-        ValueError: an emitter follows a body that is not there.
-    """
-    by_name = {body.name: body for body in bodies}
-
-    def placed(fluid: FluidParameters, number: int, emitter: EmitterParameters) -> EmitterParameters:
-        if emitter.follow is None:
-            return emitter
-        if emitter.follow not in by_name:
-            raise ValueError(f'fluid "{fluid.name}" emitter[{number}]: no rigid body is named "{emitter.follow}"')
-        body = by_name[emitter.follow]
-        return placed_on(emitter, body) if body.kind == "static" else emitter
-
-    return tuple(
-        fluid.model_copy(
-            update={"emitter": tuple(placed(fluid, number, each) for number, each in enumerate(fluid.emitter))}
-        )
-        for fluid in fluids
-    )
 
 
 def _check_openings(

@@ -146,7 +146,7 @@ def _fall_speed(job: Job) -> float:
         for emitter in fluid.emitter:
             direction = np.asarray(emitter.direction)
             points.append(np.array([emitter.position]))
-            velocities.append(np.array([emitter.speed / np.linalg.norm(direction) * direction]))
+            velocities.append(np.array([emitter.inflow_speed / np.linalg.norm(direction) * direction]))
     return expected_speed(np.concatenate(points), np.concatenate(velocities), job.domain, job.gravity)
 
 

@@ -81,6 +81,13 @@ def states_of(rows: NDArray[np.generic]) -> BodyStates:
     return BodyStates(of_bodies[:, :3], rotations, of_bodies[:, 12:15], of_bodies[:, 15:])
 
 
+def at_origin(count: int) -> BodyStates:
+    """So many bodies at rest at the origin, unturned."""
+    return BodyStates(
+        np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3))
+    )
+
+
 class Boundary:
     """Samples of walls and bodies, as the sums over neighbours read them.
 

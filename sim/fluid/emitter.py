@@ -17,7 +17,7 @@ from sim.core.motion import rotation
 from sim.core.motion.paths import Motion
 from sim.core.parameters import Vector3
 from sim.core.scan import exclusive_scan, scan_scratch_length
-from sim.fluid.boundary import BodyStates
+from sim.fluid.boundary import BodyStates, at_origin
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.kernels import Discretization, wall_layers
 from sim.fluid.opening import is_same_opening, openings_of
@@ -25,7 +25,6 @@ from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Layer, Particles, ParticleSet
 from sim.shapes.parameters import Placement
 
-NO_STATES = BodyStates(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
 FAR_IN_SUPPORTS = 4.0  # how far from the domain pistons wait that have nothing to do
 BLOCKED_IN_SPACINGS = 0.75  # of a spacing, or the distance of layers if less: nearer to another one no particle is put
 MOUTH_DEPTH_IN_SPACINGS = 0.7  # how far behind the last layer of a wall's samples a mouth reaches that leads through it
@@ -93,7 +92,7 @@ class Emission:
         self._phase, self.openings = [number for number, _ in openings], [opening for _, opening in openings]
         self._carriers = [None if each.follow is None else carriers[each.follow] for each in self.openings]
         self._layers = np.zeros(len(self.openings), dtype=np.int64)
-        self._states, self._states_s = NO_STATES, 0.0
+        self._states, self._states_s = at_origin(0), 0.0
         self._is_plug = np.zeros(len(self.openings), dtype=bool)
         # Of emitters with one opening, one after the other, the first stands for it while none emits.
         self._stands_in = [
@@ -192,7 +191,7 @@ class Emission:
     def pistons(self) -> BodyStates:
         """Where the pistons are now: the poses of the samples of each."""
         if not self.openings:
-            return NO_STATES
+            return at_origin(0)
         rows = [self._piston(number) for number in range(len(self.openings))]
         return BodyStates(*(np.stack(each) for each in zip(*rows, strict=True)))
 

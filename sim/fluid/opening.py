@@ -128,6 +128,11 @@ class Opening:
             return whole
         return int(total - 1) % whole + 1
 
+    def particles_due(self, time_s: float) -> int:
+        """Particles of the layers that have left by a time [s]."""
+        layers = self.layers_due(time_s)
+        return 0 if layers == 0 else self.count_of(0) + (layers - 1) * len(self.places)
+
     def leaves_at(self, layer: int) -> float:
         """Time when a layer leaves [s]."""
         passed = layer + self.count_of(0) / len(self.places)
@@ -181,7 +186,9 @@ class Opening:
         velocity = (self.speed + carried) * self.direction(motions[0])
         return points, np.broadcast_to(velocity, points.shape)
 
-    def is_behind(self, points: NDArray[np.floating], carrier: Motion, spacing: float, depth: float) -> NDArray[np.bool_]:
+    def is_behind(
+        self, points: NDArray[np.floating], carrier: Motion, spacing: float, depth: float
+    ) -> NDArray[np.bool_]:
         """Which points of the world [m], (m, 3), are in its mouth or behind it, down to a depth [m], (m,)."""
         own = self.to_own(points, carrier)
         nearest, _ = cKDTree(self.places).query(own[:, :2], distance_upper_bound=MOUTH_IN_SPACINGS * spacing)
@@ -299,7 +306,9 @@ def _cut_layers(section: Section, area: float, spacing: float) -> Iterator[tuple
 
 
 def _disc(radius: float) -> Section:
-    return Section(np.full(2, radius), lambda points: radius - np.hypot(points[:, 0], points[:, 1]), math.pi * radius**2)
+    return Section(
+        np.full(2, radius), lambda points: radius - np.hypot(points[:, 0], points[:, 1]), math.pi * radius**2
+    )
 
 
 def _half_size(emitter: EmitterParameters, places: NDArray[np.float64], spacing: float) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import taichi as ti
 from sim.core.cells import CellGrid
 from sim.core.neighbors import cells_per_radius
 from sim.fluid.body_forces import BodyForces
-from sim.fluid.boundary import STATE_WIDTH, BodyStates, Boundary, states_of
+from sim.fluid.boundary import BodyStates, Boundary, at_origin, states_of
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.emitter import Carrier, Emission
 from sim.fluid.kernels import Discretization
@@ -121,7 +121,7 @@ class ParticleTank:
             grid=self.grid,
             discretization=discretization,
         )
-        self._bodies = states_of(np.zeros(start.body_count * STATE_WIDTH))
+        self._bodies = at_origin(start.body_count)
         self.body_forces = BodyForces(self.boundary, self.grid, self._search_radius)
         count = len(start.positions)
         capacity = max(start.capacity or 0, count)
@@ -148,7 +148,8 @@ class ParticleTank:
         self.last_speed = float(np.sqrt((np.asarray(start.velocities, np.float64) ** 2).sum(axis=1).max(initial=0.0)))
         self.motion = MotionSummary(self.last_speed, float(np.linalg.norm(start.gravity)))
         self.emission.carry(self._bodies)
-        self._place_bodies()
+        if pistons:
+            self._place_bodies()
         self._expect_inflow()
         self.begin_frame()
         self.find_neighbors()
@@ -298,7 +299,8 @@ class ParticleTank:
         self.removed = int(arrays["particles_removed"][0])
         self._next_particle_id = int(arrays["next_particle_id"][0])
         self.emission.restore(arrays)
-        self._bodies = states_of(arrays["body_states"].astype(np.float64)[: self._bodies.position.size // 3 * STATE_WIDTH])
+        count = len(self._bodies.position)
+        self._bodies = BodyStates(*(each[:count] for each in states_of(arrays["body_states"].astype(np.float64))))
         self.emission.carry(self._bodies)
         self.peak_speed = self.motion.max_speed
         if self.body_forces.sheets is not None:

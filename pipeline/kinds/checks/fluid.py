@@ -7,12 +7,15 @@ import numpy as np
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.jets import check_jets
-from pipeline.model.amounts import rounded_down
+from pipeline.kinds.checks.shapes import mesh_exists
+from pipeline.kinds.checks.vessels import check_vessels
+from pipeline.model.amounts import rounded_down, rounded_up
 from pipeline.model.boxes import domain_box, overlap
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings, format_path
-from sim.fluid.opening import Opening, opening_problem
+from pipeline.model.problems import Findings, format_path, unknown_name
+from sim.coupling.emitter_bodies import emitter_on
+from sim.fluid.opening import Opening, followed, opening_problem
 from sim.fluid.parameters import FluidParameters, shared_conflicts
 from sim.shapes.parameters import BoxShape
 from sim.shapes.sampling import fill_with_particles
@@ -20,6 +23,8 @@ from sim.shapes.sampling import fill_with_particles
 THINNEST_PLATE_IN_SPACINGS = 1.9
 """Twice the depth of a body's samples (`sim.fluid.boundary_akinci2012`). Fluid rests 0.4 spacings off a thicker plate,
 as off any wall, 0.9 off one of half that, 1.3 off the thinnest."""
+FEWEST_FRAMES_ACROSS = 10
+"""A jet by its flow rate that crosses the domain in fewer frames comes out of too narrow an opening, most likely."""
 # Points of a block that are looked at for an overlap with another fluid's.
 OVERLAP_SAMPLES = 20_000
 
@@ -33,24 +38,30 @@ def check_fluids(job: Job, solids: Solids, findings: Findings) -> None:
     openings: dict[KeyPath, Opening] = {}
     for index, fluid in enumerate(job.fluid):
         _check_speeds(job, index, findings)
-        for number, opening in openings_of(fluid, index, findings):
+        for number, opening in openings_of(job, index, findings):
             path: KeyPath = ("fluid", index, "emitter", number)
             _check_emitter(job, path, opening, openings, solids, findings=findings)
             openings[path] = opening
     if openings:
         check_jets(job, solids, openings, job.fluid[0].spacing, findings)
+        check_vessels(job, solids, openings, findings)
 
 
-def openings_of(
-    fluid: FluidParameters, index: int = 0, findings: Findings | None = None
-) -> Iterator[tuple[int, Opening]]:
-    """The openings of a fluid's emitters that are wide enough; the others are noted."""
+def openings_of(job: Job, index: int, findings: Findings | None = None) -> Iterator[tuple[int, Opening]]:
+    """The openings of a fluid's emitters that can be, where they are at the start; what is wrong with others is noted."""
+    fluid, bodies = job.fluid[index], {body.name: body for body in job.rigid}
+    noted = Findings() if findings is None else findings
     for number, emitter in enumerate(fluid.emitter):
-        try:
-            yield number, Opening.of(emitter, fluid.spacing, fluid.lattice_volume, fluid.support_in_spacings)
-        except ValueError as error:
-            if findings is not None:
-                findings.error(("fluid", index, "emitter", number, "shape"), str(error))
+        path: KeyPath = ("fluid", index, "emitter", number)
+        if emitter.follow is not None and emitter.follow not in bodies:
+            problem = unknown_name(emitter.follow, bodies, "rigid body", plural="bodies", none="; add [[rigid]]")
+            noted.error((*path, "follow"), problem)
+        elif mesh_exists(emitter.shape, path, noted):
+            own = emitter_on(emitter, bodies)
+            try:
+                yield number, Opening.of(own, fluid.spacing, fluid.lattice_volume, followed(own, bodies))
+            except ValueError as error:
+                noted.error((*path, "shape"), str(error))
 
 
 def _check_emitter(
@@ -68,6 +79,32 @@ def _check_emitter(
         findings.error(path, reason)
     if opening.start_s >= job.film_s:
         findings.warn((*path, "start_s"), f"starts at {opening.start_s:g} s, after the film's end at {job.film_s:g} s")
+    elif opening.inflow.travel_at(job.film_s) == 0.0:
+        findings.warn((*path, "ramp"), f"is 0 whenever it emits in the film's {job.film_s:g} s: it emits nothing")
+    _check_amount(job, path, opening, findings)
+
+
+def _check_amount(job: Job, path: KeyPath, opening: Opening, findings: Findings) -> None:
+    """Refuse an amount of less than a particle, and warn of a rate that takes a jet too fast for the scene."""
+    fluid = job.fluid[int(path[1])]
+    emitter = fluid.emitter[int(path[3])]
+    if opening.speed > 0.0 and opening.total_particles == 0.0:
+        key = "end_s" if emitter.total_volume is None else "total_volume"
+        volume, particle = opening.inflow.total_travel * emitter.area, fluid.lattice_volume
+        radius = rounded_down(0.5 * (2.0 * volume) ** (1.0 / 3.0))
+        findings.error(
+            (*path, key),
+            f"makes {volume:.2g} m³ in all, less than half a particle of {particle:.2g} m³: it emits nothing; use more, "
+            f"or particle_radius {radius:g} m",
+        )
+    sane = math.dist(job.domain.min, job.domain.max) * job.fps / FEWEST_FRAMES_ACROSS
+    if emitter.flow_rate is not None and emitter.inflow_speed > sane:
+        findings.warn(
+            (*path, "flow_rate"),
+            f"{emitter.flow_rate:g} m³/s through {emitter.area:.2g} m² is a jet of {emitter.inflow_speed:.3g} m/s, which "
+            f"crosses the domain within {FEWEST_FRAMES_ACROSS} frames; use an opening of "
+            f"{rounded_up(emitter.flow_rate / sane):g} m², or {rounded_down(sane * emitter.area):g} m³/s",
+        )
 
 
 def _check_speeds(job: Job, index: int, findings: Findings) -> None:
@@ -75,7 +112,11 @@ def _check_speeds(job: Job, index: int, findings: Findings) -> None:
     fastest = math.dist(job.domain.min, job.domain.max) * job.fps
     fluid = job.fluid[index]
     speeds = [(("block", number, "velocity"), math.hypot(*block.velocity)) for number, block in enumerate(fluid.block)]
-    speeds += [(("emitter", number, "speed"), emitter.speed) for number, emitter in enumerate(fluid.emitter)]
+    speeds += [
+        (("emitter", number, "speed"), emitter.speed)
+        for number, emitter in enumerate(fluid.emitter)
+        if emitter.speed is not None
+    ]
     for key, speed in speeds:
         if speed > fastest:
             findings.warn(

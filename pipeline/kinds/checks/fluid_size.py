@@ -39,7 +39,7 @@ def check_fluid_size(job: Job, index: int, solids: Solids, budget: MemoryBudget,
     """Particles that the fluid will have, about."""
     fluid = job.fluid[index]
     blocks = {path: solid for path, solid in solids.items() if path[:3] == ("fluid", index, "block")}
-    expected = particle_room(job, fluid, sum(solid.volume for solid in blocks.values()))
+    expected = particle_room(job, index, sum(solid.volume for solid in blocks.values()))
     each = _bytes_per_particle(fluid, on_gpu=budget.on_gpu)
     if refusal := budget.refusal(expected, "particles", each):
         radius = fluid.particle_radius * (expected / (budget.bytes // each)) ** (1.0 / 3.0)
@@ -50,14 +50,15 @@ def check_fluid_size(job: Job, index: int, solids: Solids, budget: MemoryBudget,
     coarsening = max(1.0, (expected / COUNTED_PARTICLES) ** (1 / 3))
     start = sum(_check_block(job, path, solids, coarsening, findings) for path in blocks)
     most = math.inf if fluid.max_particles is None else max(start, fluid.max_particles)
-    emitted = sum(len(opening.points) * opening.layers_due(job.film_s) for _, opening in openings_of(fluid))
+    emitted = sum(opening.particles_due(job.film_s) for _, opening in openings_of(job, index))
     return int(min(start + emitted, most))
 
 
-def particle_room(job: Job, fluid: FluidParameters, block_volume: float) -> float:
+def particle_room(job: Job, index: int, block_volume: float) -> float:
     """Particles that the simulation makes room for: those of blocks [m³], and all that emitters may ever add."""
+    fluid = job.fluid[index]
     start = block_volume / fluid.lattice_volume
-    emitted = sum(opening.total_particles() for _, opening in openings_of(fluid))
+    emitted = sum(opening.total_particles for _, opening in openings_of(job, index))
     domain: float = math.prod(np.subtract(job.domain.max, job.domain.min).tolist())
     most = min(domain, fluid.most_volume) / fluid.lattice_volume
     return max(start, min(start + emitted, most))

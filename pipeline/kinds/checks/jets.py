@@ -1,7 +1,8 @@
-"""Checks of jets: against obstacles right before an emitter, or into the nozzle of another one.
+"""Checks of jets: against obstacles right before an emitter, or into the opening of another one.
 
-A jet is followed as its middle flies, straight through its nozzle and on a parabola from there, up to the first thing
-that it meets: what becomes of it then nobody can tell without the simulation. Bodies and blocks stand where they start.
+A jet is followed as its middle flies, on a parabola, up to the first thing that it meets: what becomes of it then nobody
+can tell without the simulation. Bodies and blocks stand where they start, and so do openings: those that move are not
+looked at.
 """
 
 import math
@@ -17,7 +18,7 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path
 from sim.core.domain import DomainParameters
-from sim.fluid.opening import Opening, is_same_nozzle
+from sim.fluid.opening import Opening, is_same_opening
 from sim.shapes.solid import Solid
 
 Points = NDArray[np.float64]
@@ -32,7 +33,8 @@ MOST_BLOCKED = 0.5
 def check_jets(
     job: Job, solids: Solids, openings: Mapping[KeyPath, Opening], spacing: float, findings: Findings
 ) -> None:
-    """Warn of jets, of particles of a spacing [m], that cannot leave their opening or run into another nozzle."""
+    """Warn of jets, of particles of a spacing [m], that cannot leave their opening or run into another one."""
+    openings = {path: opening for path, opening in openings.items() if not opening.moves and opening.speed > 0.0}
     bodies = [solid for path, solid in solids.items() if path[0] == "rigid"]
     blocks = [solid for path, solid in solids.items() if path[0] == "fluid"]
     for path, opening in openings.items():
@@ -45,27 +47,26 @@ def check_jets(
                 "get away; particles will be squeezed, and their places be taken: move or turn it",
             )
             continue
-        flight = _fly(job, opening, [*bodies, *blocks], spacing)
+        flight = fly(job, opening, [*bodies, *blocks], spacing)
         for other_path, other in openings.items():
-            if is_same_nozzle(opening, other, spacing):
+            if is_same_opening(opening, other, spacing):
                 continue
-            arrival = _arrival(*flight, opening, other, spacing=spacing)
+            arrival = _arrival(*flight, opening, other)
             if arrival is not None:
                 findings.warn(
                     path,
-                    f"its jet runs into the nozzle of {format_path(other_path)} {arrival:.2g} s after it has begun; "
-                    "what flows there gives way to nothing, so particles will be squeezed: move or turn one of them",
+                    f"its jet runs into the opening of {format_path(other_path)} {arrival:.2g} s after it has begun, "
+                    "and will take the places of what flows in there: move or turn one of them",
                 )
 
 
 def _room_needed(opening: Opening) -> float:
     """How far a wall has to be from an opening for the flow to get away sideways no faster than it comes [m].
 
-    Beyond the nozzle the way out around the jet, perimeter times distance, has to be as large as its cross-section.
+    Beyond its first layer the way out around the jet, perimeter times distance, has to be as large as its cross-section.
     """
     first, second = opening.half_size
-    across = 0.5 * first if opening.is_round else first * second / (first + second)
-    return opening.nozzle_depth + across
+    return opening.layer_distance + first * second / (first + second)
 
 
 def _room_before(
@@ -74,8 +75,8 @@ def _room_before(
     """How far most of a jet gets straight ahead [m], as far as it is needed."""
     # The particles of a layer are half a layer ahead of the opening.
     ahead = np.append(np.arange(0.5 * opening.layer_distance, needed, 0.5 * spacing), needed)
-    shifts = (ahead - 0.5 * opening.layer_distance)[:, None, None] * opening.direction
-    points = (opening.points[None] + shifts).reshape(-1, 3)
+    shifts = (ahead - 0.5 * opening.layer_distance)[:, None, None] * opening.direction(opening.placement)
+    points = (opening.points(1)[None] + shifts).reshape(-1, 3)
     blocked = _beyond_walls(points, domain)
     for solid in bodies:
         if touch(solid.bounds, _box_around(points), margin=0.0):
@@ -85,24 +86,26 @@ def _room_before(
     return float(ahead[reached[0]]) if len(reached) else needed
 
 
-def _fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float) -> tuple[Points, Times]:
+def fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float) -> tuple[Points, Times]:
     """Path of a jet's middle until it meets a wall, a body or a block, leaves the domain, or the film ends.
 
     Returns:
         Points [m], (k, 3), and times [s], (k,).
     """
-    gravity, driven_s = np.asarray(job.gravity, dtype=np.float64), opening.nozzle_depth / opening.speed
+    gravity, out_s = np.asarray(job.gravity, dtype=np.float64), opening.layer_distance / opening.speed
+    centre = opening.to_world(np.zeros((1, 3)), opening.placement)
+    velocity = opening.speed * opening.direction(opening.placement)
 
     def places(times: Times) -> Points:
-        flown = np.maximum(times - driven_s, 0.0)[:, None]
-        path: Points = opening.centre + times[:, None] * opening.velocity + 0.5 * flown**2 * gravity
+        flown = times[:, None]
+        path: Points = centre + flown * velocity + 0.5 * flown**2 * gravity
         return path
 
     def are_outside(points: Points) -> NDArray[np.bool_]:
         outside: NDArray[np.bool_] = ((points < job.domain.min) | (points > job.domain.max)).any(axis=1)
         return outside
 
-    film_s, end_s = job.film_s - opening.start_s, 2.0 * driven_s
+    film_s, end_s = job.film_s - opening.start_s, 2.0 * out_s
     while end_s < film_s and not are_outside(places(np.array([end_s])))[0]:
         end_s *= 2.0
     end_s = max(0.0, min(end_s, film_s))
@@ -115,18 +118,17 @@ def _fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float)
     stopped = np.zeros(inside, dtype=bool)
     for solid in obstacles:
         if inside and touch(solid.bounds, _box_around(points), margin=0.0):
-            # What it comes out of is not in its way: blocks around a nozzle are pushed aside.
-            stopped |= (solid.signed_distance(points) < 0.0) & (times > driven_s)
+            # What it comes out of is not in its way: blocks around an opening are pushed aside.
+            stopped |= (solid.signed_distance(points) < 0.0) & (times > out_s)
     kept = _until_first(stopped)
     return points[:kept], times[:kept]
 
 
-def _arrival(points: Points, times: Times, opening: Opening, other: Opening, *, spacing: float) -> float | None:
-    """When the core of a jet comes into another nozzle or its pipe [s], or None."""
+def _arrival(points: Points, times: Times, opening: Opening, other: Opening) -> float | None:
+    """When the core of a jet comes to another opening [s], or None."""
     if not len(points):
         return None
-    nozzle = cKDTree(np.concatenate([other.nozzle_places(), other.pipe(spacing)]))
-    distance, _ = nozzle.query(points)
+    distance, _ = cKDTree(other.points(1)).query(points)
     near = np.flatnonzero(distance < min(opening.half_size))
     return float(times[near[0]]) if len(near) else None
 

@@ -52,7 +52,7 @@ def expected_speed(job: Job, solids: Solids) -> float:
     """
     fall = 2.0 * math.hypot(*job.gravity) * math.dist(job.domain.min, job.domain.max)
     speeds = [math.hypot(*block.velocity) for fluid in job.fluid for block in fluid.block]
-    speeds += [emitter.speed for fluid in job.fluid for emitter in fluid.emitter]
+    speeds += [emitter.inflow_speed for fluid in job.fluid for emitter in fluid.emitter]
     fastest = math.sqrt(fall + max(speeds, default=0.0) ** 2)
     for index, body in enumerate(job.rigid):
         if body.kind != "static" and (solid := solids.get(("rigid", index))) is not None:
