@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sim.fluid.opening import openings_of
+from sim.shapes.packing import Surroundings, pack
 from sim.shapes.placement import build_solid
-from sim.shapes.sampling import fill_with_particles
 
 if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
@@ -21,12 +21,9 @@ if TYPE_CHECKING:
     from sim.shapes.solid import Solid
 
 
-CLEARANCE_IN_SPACINGS = 0.5  # a particle's centre keeps half a lattice spacing, its radius, from walls and solids
-TAKEN_IN_SPACINGS = 0.9  # a place is taken where a particle is nearer: they would push each other apart at once
 SHEET_PLAY_IN_SPACINGS = 0.05  # how much nearer to a sheet than at rest a block may start, whose lattice lies anywhere
 NO_POINTS = np.empty((0, 3))
 FULL_DOMAIN = 1.1  # particles that a domain holds at most over those that fill it at rest; emitters stop there
-ROUNDING = 1.0e-3  # of the clearance: lattice points are float32, and the first layer on a body is exactly that far
 
 
 @dataclass(frozen=True)
@@ -44,9 +41,9 @@ def fill_fluids(
     solids: Sequence[Solid],
     sheets: NDArray[np.floating] = NO_POINTS,
 ) -> FluidFilling:
-    """Fill the blocks of all fluids on lattices of spacing 2r, clear of walls, solids and each other.
+    """Fill the blocks of all fluids with particles of spacing 2r, as many as their volumes hold.
 
-    A place in two blocks belongs to the first, of the first fluid that has it.
+    They are clear of walls and solids. What two blocks share belongs to the first, of the first fluid that has it.
     Fluid keeps its distance from the boundary samples of sheets [m], (m, 3), too.
 
     Raises:
@@ -55,11 +52,13 @@ def fill_fluids(
     """
     positions, velocities = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
     phase = [np.empty(0, np.int32)]
+    filled: list[Solid] = []
     for index, fluid in enumerate(fluids):
         spacing = fluid.spacing
         for number, block in enumerate(fluid.block):
-            points = fill_with_particles(build_solid(block), spacing, lower=domain.min, upper=domain.max)
-            points = free_places(points, spacing, solids, np.concatenate(positions))
+            solid = build_solid(block)
+            points = pack(solid, spacing, surroundings(domain, solids, filled), np.concatenate(positions))
+            filled.append(solid)
             if len(sheets) and len(points):
                 clearance = _sheet_clearance(fluid.support_in_spacings) * spacing
                 points = points[cKDTree(sheets).query(points)[0] > clearance]
@@ -74,17 +73,10 @@ def fill_fluids(
     return FluidFilling(np.concatenate(positions), np.concatenate(velocities), np.concatenate(phase))
 
 
-def free_places(
-    points: NDArray[np.float32], spacing: float, solids: Sequence[Solid], taken: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """The lattice points [m], (n, 3), that are neither in a solid nor where a particle is, `taken`, (k, 3)."""
-    clearance = (1.0 - ROUNDING) * CLEARANCE_IN_SPACINGS * spacing
-    for solid in solids:
-        points = points[solid.signed_distance(points.astype(np.float64)) >= clearance]
-    if len(taken) and len(points):
-        distance, _ = cKDTree(taken).query(points, distance_upper_bound=TAKEN_IN_SPACINGS * spacing)
-        points = points[~np.isfinite(distance)]
-    return points
+def surroundings(domain: DomainParameters, walls: Sequence[Solid], filled: Sequence[Solid]) -> Surroundings:
+    """What bounds a block: the domain, solid bodies, and the blocks that were filled before it."""
+    open_faces = [np.array([f"{axis}{side}" in domain.open_faces for axis in "xyz"]) for side in "-+"]
+    return Surroundings(np.array(domain.min), np.array(domain.max), walls, filled, *open_faces)
 
 
 def _sheet_clearance(support_in_spacings: float) -> float:

@@ -1,7 +1,6 @@
 """Checks of the size of fluids: particles, memory, and blocks that hold none."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -9,15 +8,14 @@ from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.fluid import openings_of
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.model.amounts import count, gigabytes, rounded_up
-from pipeline.model.boxes import ALL, domain_box, overlap, span, touch
+from pipeline.model.boxes import ALL, domain_box, overlap, span
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, Problem
 from sim.core.domain import DomainParameters
-from sim.fluid.filling import free_places
+from sim.fluid.filling import surroundings
 from sim.fluid.parameters import FluidParameters
-from sim.shapes.sampling import fill_with_particles
-from sim.shapes.solid import Solid
+from sim.shapes.packing import amount
 
 BYTES_PER_PARTICLE, BYTES_PER_PARTICLE_ON_GPU = 1024, 600
 """Upper bounds of what the solvers take, neighbour search included, and on a CPU the snapshots."""
@@ -29,10 +27,6 @@ BYTES_PER_SEARCH_CELL = 16
 BYTES_PER_WALL_SAMPLE = 150
 MOST_CELLS = 2**28
 """`sim.core.cells.MAX_CELLS`, which is not imported here as that loads Taichi; a test holds them together."""
-COUNTED_PARTICLES = 200_000
-"""Up to so many particles a fluid is filled as the simulation fills it; beyond, a coarser lattice is scaled up."""
-# Share of a spacing by which sizes written in decimal may fall short of a whole number of spacings.
-ROUND_OFF_IN_SPACINGS = 1.0e-6
 
 
 def check_fluid_size(job: Job, index: int, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
@@ -47,8 +41,7 @@ def check_fluid_size(job: Job, index: int, solids: Solids, budget: MemoryBudget,
         findings.error(("fluid", index, "particle_radius"), f"{refusal}: use {rounded_up(radius):g} m or more{remedy}")
         return int(expected)
     _check_domain_size(job.domain, fluid, budget, findings)
-    coarsening = max(1.0, (expected / COUNTED_PARTICLES) ** (1 / 3))
-    start = sum(_check_block(job, path, solids, coarsening, findings) for path in blocks)
+    start = sum(_check_block(job, path, solids, findings) for path in blocks)
     most = math.inf if fluid.max_particles is None else max(start, fluid.max_particles)
     emitted = sum(opening.particles_due(job.film_s) for _, opening in openings_of(job, index))
     return int(min(start + emitted, most))
@@ -94,50 +87,34 @@ def _check_domain_size(
         )
 
 
-def _check_block(job: Job, path: KeyPath, solids: Solids, coarsening: float, findings: Findings) -> int:
-    """Particles in a block, about, on a lattice that is coarser by a factor."""
-    solid, box, spacing = solids[path], domain_box(job.domain), job.fluid[int(path[1])].spacing
+def _check_block(job: Job, path: KeyPath, solids: Solids, findings: Findings) -> int:
+    """Particles in a block, as the simulation fills it."""
+    solid, box, fluid = solids[path], domain_box(job.domain), job.fluid[int(path[1])]
     inside = overlap(solid.bounds, box)
     if inside == 0.0:
         findings.error(path, f"is wholly outside the domain: it spans {span(solid.bounds)}, not {span(box)}")
         return 0
     if inside < ALL:
         findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the domain and are clipped")
-    obstacles = [each for place, each in solids.items() if place[0] == "rigid"]
-    left, kept_out = _fill(solid, spacing, coarsening, job.domain, obstacles)
-    if kept_out and not left:
+    walls = [each for place, each in solids.items() if place[0] == "rigid"]
+    earlier = [each for place, each in solids.items() if place[0] == "fluid" and place < path]
+    held, outside_walls = (
+        amount(solid, fluid.spacing, surroundings(job.domain, walls, others)) for others in (earlier, [])
+    )
+    kept_out = round(held.of_solid) - outside_walls.particles
+    if not held.particles and kept_out:
         findings.error(path, "lies wholly inside solid bodies, so it holds no particle; move it")
-    elif kept_out:
-        filled = count(left + kept_out)
-        findings.warn(path, f"overlaps a solid body: {count(kept_out)} of its {filled} particles are left out")
-    elif not left and coarsening == 1.0:
+    elif not held.particles:
         thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
         findings.error(
             path,
-            f"holds no particle: it is {thinnest:.3g} m thin and particles are {spacing:.3g} m apart; "
+            f"holds no particle: it is {thinnest:.3g} m thin and particles are {fluid.spacing:.3g} m apart; "
             "enlarge it or use a smaller particle_radius",
         )
-    if left and not kept_out:
-        _tell_masses(job.fluid[int(path[1])], path, solid.volume * inside, left, findings)
-    return left
-
-
-def _tell_masses(fluid: FluidParameters, path: KeyPath, volume: float, particles: int, findings: Findings) -> None:
-    """Tell the mass of a block's particles, and that of its volume [m³] in the domain."""
-    meant, made = fluid.rest_density * volume, fluid.rest_density * fluid.lattice_volume * particles
-    findings.facts.append(Problem(path, f"holds {made:.3g} kg of {fluid.name}, {meant:.3g} kg by its volume"))
-
-
-def _fill(
-    solid: Solid, spacing: float, coarsening: float, domain: DomainParameters, obstacles: Sequence[Solid]
-) -> tuple[int, int]:
-    """Particles that find a free place in a solid, and those that obstacles keep out, by a coarser lattice."""
-    step = spacing * coarsening
-    points = fill_with_particles(solid, step, lower=domain.min, upper=domain.max)
-    near = [obstacle for obstacle in obstacles if touch(obstacle.bounds, solid.bounds, margin=step)]
-    free = len(free_places(points, step, near, points[:0]))
-    # Whole layers fit into a box, so its fine lattice is not just coarsening³ times its coarse one.
-    extent = np.minimum(solid.bounds[1], domain.max) - np.maximum(solid.bounds[0], domain.min)
-    fine, coarse = (float(np.prod(np.floor(extent / each + ROUND_OFF_IN_SPACINGS))) for each in (spacing, step))
-    scale = fine / max(1.0, coarse)
-    return round(free * scale), round((len(points) - free) * scale)
+    elif kept_out:
+        filled = count(round(held.of_solid))
+        findings.warn(path, f"overlaps a solid body: {count(kept_out)} of its {filled} particles are left out")
+    made, meant = (fluid.rest_density * volume for volume in (held.particles * fluid.lattice_volume, held.volume))
+    if held.particles:
+        findings.facts.append(Problem(path, f"holds {made:.3g} kg of {fluid.name}, {meant:.3g} kg by its volume"))
+    return held.particles
