@@ -22,9 +22,9 @@ from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
+from sim.fluid.emitter import Carrier
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.kernels import Discretization
-from sim.fluid.emitter import Carrier
 from sim.fluid.opening import Opening, opening_problem, openings_of
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS

@@ -79,7 +79,7 @@ class Emission:
         bodies: Mapping[str, Placement],
         carriers: Mapping[str, Carrier],
     ) -> None:
-        """Take the emitters of these fluids, and the bodies that they follow by name: as they start, and which they are.
+        """Take the emitters of fluids, and the bodies that they follow by name: as they start, and which they are.
 
         Raises:
             ValueError: an opening is too narrow.

@@ -33,7 +33,7 @@ class Inflow:
         end_s: float | None,
         most: float,
     ) -> Inflow:
-        """Inflow at parts of a speed [m/s] by time [s], constant beyond these; it stops at a time, or after a way [m]."""
+        """Inflow at parts of a speed [m/s] by time [s], constant beyond these, up to a time or a travel [m]."""
         given_times, given = np.array(strengths or [(start_s, 1.0)]).T
         times = np.array([start_s, *(time for time in given_times if time > start_s)])
         speeds = speed * np.interp(times, given_times, given)

@@ -173,6 +173,11 @@ class Opening:
         arms = points - carrier.position
         return carrier.velocity + rotation.cross(carrier.angular_velocity, arms) + speed * self.direction(carrier)
 
+    @property
+    def first_jet(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Its middle [m] and the largest velocity of the inflow [m/s] where it is at the start, (3,) each."""
+        return self.to_world(np.zeros((1, 3)), self.motion(0.0))[0], self.speed * self.direction(self.motion(0.0))
+
     def outflow(self, body_speed: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Places where fluid flows out [m], (m, 3), and velocities as large as they may get there [m/s], (m, 3).
 

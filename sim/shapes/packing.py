@@ -1,10 +1,10 @@
 """Particles that fill a volume, as many as it holds, to a particle.
 
-A cubic lattice fits into few volumes: of a box of 7.5 spacings it leaves a fifth empty. So the number of particles comes
-from the volume, and the lattice from the number: its cells have the volume of a particle, but its constants along the
-axes may differ by some percent, such that whole layers fit between the sides, and the last layer may be half empty. The
-particles are on the places whose cells have most of their volume inside. Where that is nearer to a wall than fluid at
-rest, they are pushed off, and each other apart.
+A cubic lattice fits into few volumes: of a box of 7.5 spacings it leaves a fifth empty. So the number of particles
+comes from the volume. They are on the places of a lattice whose cells have most of their volume inside: a cubic one, or
+in a shape with flat sides one whose cells have the volume of a particle but constants that differ by some percent, such
+that whole layers fit between the sides, and the topmost is partly empty. Particles that are nearer to a wall than fluid
+at rest are pushed off it, and those around them apart.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def amount(solid: PlacedSolid, spacing: float, around: Surroundings) -> Amount:
 
 
 def pack(solid: PlacedSolid, spacing: float, around: Surroundings, taken: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Positions [m], (n, 3), of the particles of a spacing [m] that fill a solid; those taken, (k, 3), stay where they are.
+    """Positions [m], (n, 3), of the particles of a spacing [m] that fill a solid; those taken, (k, 3), stay there.
 
     Raises:
         ShapeError: the lattice would have more than 2³¹ places.
@@ -145,7 +145,7 @@ def _clipped_volume(solid: PlacedSolid, around: Surroundings) -> float:
 
 
 def _share(solid: PlacedSolid, spacing: float, around: Surroundings, *, clipped: bool = False) -> float:
-    """Share of a solid's volume that is free of what is around it; of that within the domain, or if so clipped by it."""
+    """Share of a solid's volume in the domain that is free of what is around it; or of all of it, if so clipped."""
     low, high = solid.bounds
     if not clipped:
         low, high = np.maximum(low, around.lower), np.minimum(high, around.upper)
@@ -182,8 +182,8 @@ def _lattices(
     if np.prod(extent / spacing + 1.0) > MOST_PLACES:
         edges = " x ".join(f"{edge:g}" for edge in extent)
         raise ShapeError(
-            f"filling {edges} m at a spacing of {spacing:g} m takes {np.prod(extent / spacing):.2g} lattice points; use "
-            "a larger spacing or a smaller volume"
+            f"filling {edges} m at a spacing of {spacing:g} m takes {np.prod(extent / spacing):.2g} lattice points; "
+            "use a larger spacing or a smaller volume"
         )
     for lines in _choices(solid, extent, spacing, axes):
         steps = np.array([line.step for line in lines])

@@ -36,22 +36,22 @@ def fluid_over(job: Job, solids: Solids, box: Box) -> float:
                 is_above = (box.mean(axis=0) - solid.bounds.mean(axis=0))[down] * gravity[down] > 0.0
                 shared = np.clip(np.minimum(high, box[1]) - np.maximum(low, box[0]), 0.0, None)[sides]
                 volume += is_above * solid.volume * float(np.prod(shared / (high - low)[sides]))
-        for _, opening in openings_of(fluid):
+        for _, opening in openings_of(job, index):
             if _falls_onto(opening, box, gravity, down):
-                volume += len(opening.points) * opening.layers_due(job.film_s) * fluid.lattice_volume
+                volume += opening.particles_due(job.film_s) * fluid.lattice_volume
         mass += fluid.rest_density * min(volume, fluid.most_volume)
     return mass
 
 
 def _falls_onto(opening: Opening, box: Box, gravity: NDArray[np.float64], down: int) -> bool:
     """Whether the middle of a jet comes down to the middle of a box within its sides."""
-    sign = float(np.sign(gravity[down]))
-    drop = sign * float(box[:, down].mean() - opening.centre[down])
-    speed, pull = sign * float(opening.velocity[down]), abs(float(gravity[down]))
+    sign, (centre, velocity) = float(np.sign(gravity[down])), opening.first_jet
+    drop = sign * float(box[:, down].mean() - centre[down])
+    speed, pull = sign * float(velocity[down]), abs(float(gravity[down]))
     if drop <= 0.0:
         return False
     time = 2.0 * drop / (speed + math.sqrt(speed**2 + 2.0 * pull * drop))
-    point = opening.centre + time * opening.velocity + 0.5 * time**2 * gravity
+    point = centre + time * velocity + 0.5 * time**2 * gravity
     within = (point >= box[0]) & (point <= box[1])
     within[down] = True
     return bool(within.all())

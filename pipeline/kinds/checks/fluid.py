@@ -16,7 +16,7 @@ from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path, unknown_name
 from sim.coupling.emitter_bodies import emitter_on
 from sim.fluid.opening import Opening, followed, opening_problem
-from sim.fluid.parameters import FluidParameters, shared_conflicts
+from sim.fluid.parameters import shared_conflicts
 from sim.shapes.parameters import BoxShape
 from sim.shapes.sampling import fill_with_particles
 
@@ -48,7 +48,7 @@ def check_fluids(job: Job, solids: Solids, findings: Findings) -> None:
 
 
 def openings_of(job: Job, index: int, findings: Findings | None = None) -> Iterator[tuple[int, Opening]]:
-    """The openings of a fluid's emitters that can be, where they are at the start; what is wrong with others is noted."""
+    """The openings of a fluid's emitters that can be, at the start; what is wrong with others is noted."""
     fluid, bodies = job.fluid[index], {body.name: body for body in job.rigid}
     noted = Findings() if findings is None else findings
     for number, emitter in enumerate(fluid.emitter):
@@ -94,15 +94,15 @@ def _check_amount(job: Job, path: KeyPath, opening: Opening, findings: Findings)
         radius = rounded_down(0.5 * (2.0 * volume) ** (1.0 / 3.0))
         findings.error(
             (*path, key),
-            f"makes {volume:.2g} m³ in all, less than half a particle of {particle:.2g} m³: it emits nothing; use more, "
-            f"or particle_radius {radius:g} m",
+            f"makes {volume:.2g} m³ in all, less than half a particle of {particle:.2g} m³: it emits nothing; "
+            f"use more, or particle_radius {radius:g} m",
         )
     sane = math.dist(job.domain.min, job.domain.max) * job.fps / FEWEST_FRAMES_ACROSS
     if emitter.flow_rate is not None and emitter.inflow_speed > sane:
         findings.warn(
             (*path, "flow_rate"),
-            f"{emitter.flow_rate:g} m³/s through {emitter.area:.2g} m² is a jet of {emitter.inflow_speed:.3g} m/s, which "
-            f"crosses the domain within {FEWEST_FRAMES_ACROSS} frames; use an opening of "
+            f"{emitter.flow_rate:g} m³/s through {emitter.area:.2g} m² is a jet of {emitter.inflow_speed:.3g} m/s, "
+            f"which crosses the domain within {FEWEST_FRAMES_ACROSS} frames; use an opening of "
             f"{rounded_up(emitter.flow_rate / sane):g} m², or {rounded_down(sane * emitter.area):g} m³/s",
         )
 

@@ -1,8 +1,7 @@
 """Checks of jets: against obstacles right before an emitter, or into the opening of another one.
 
-A jet is followed as its middle flies, on a parabola, up to the first thing that it meets: what becomes of it then nobody
-can tell without the simulation. Bodies and blocks stand where they start, and so do openings: those that move are not
-looked at.
+A jet is followed as its middle flies, on a parabola, up to the first thing that it meets: what becomes of it then
+nobody can tell without the simulation. Bodies and blocks stand where they start; openings that move are not looked at.
 """
 
 import math
@@ -63,7 +62,7 @@ def check_jets(
 def _room_needed(opening: Opening) -> float:
     """How far a wall has to be from an opening for the flow to get away sideways no faster than it comes [m].
 
-    Beyond its first layer the way out around the jet, perimeter times distance, has to be as large as its cross-section.
+    Beyond its first layer the way out around the jet, perimeter times distance, has to be as large as its section.
     """
     first, second = opening.half_size
     return opening.layer_distance + first * second / (first + second)
@@ -93,8 +92,7 @@ def fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float) 
         Points [m], (k, 3), and times [s], (k,).
     """
     gravity, out_s = np.asarray(job.gravity, dtype=np.float64), opening.layer_distance / opening.speed
-    centre = opening.to_world(np.zeros((1, 3)), opening.placement)
-    velocity = opening.speed * opening.direction(opening.placement)
+    centre, velocity = opening.first_jet
 
     def places(times: Times) -> Points:
         flown = times[:, None]

@@ -143,13 +143,13 @@ FOUNTAIN = emitter("[0.0, 0.0, 0.16]", "[0.17365, 0, 0.98481]", speed=3.0)
 @pytest.mark.parametrize(
     ("text", "arrival"),
     [
-        # Straight ahead at 5 m/s to the edge of the other opening, 0.8 m away, and from above by a fall of half a metre.
+        # Straight ahead at 5 m/s to the edge of the other, 0.8 m away, and from above by a fall of half a metre.
         (emitter("[0.45, 0.0, 0.5]", "[-1, 0, 0]", speed=5.0, more="start_s = 0.2") + ACROSS, "0.15"),
         (emitter("[0.1, 0.0, 0.25]", "[0, 0, -1]") + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]"), "0.2"),
         # On a parabola over 0.6 m, which is 9 cm lower there than a straight line.
         (emitter("[0.3, 0.0, 0.22]", "[0, 0, -1]") + emitter("[-0.4, 0.0, 0.55]", "[1, 0, 0]", speed=3.0), "0.2"),
-        # Up at 80 degrees and down again after 2 v sin(80°)/g = 0.60 s, 0.31 m away: 1.6 times as long as it would take to
-        # the far corner without gravity. The core is there a little sooner.
+        # Up at 80 degrees and down again after 2 v sin(80°)/g = 0.60 s, 0.31 m away: 1.6 times as long as it would
+        # take to the far corner without gravity. The core is there a little sooner.
         (emitter("[0.3, 0.0, 0.16]", "[0, 0, 1]", more="start_s = 0.9") + FOUNTAIN, "0.58"),
     ],
     ids=["head-on", "from above", "on a parabola", "fountain"],
@@ -274,8 +274,8 @@ def test_what_an_emitter_cannot_be_is_refused_with_the_number_that_decides(text,
     [
         (
             JET.replace("speed = 1.0", "flow_rate = 1.0"),
-            "11 fluid[0].emitter[0].flow_rate: 1 m³/s through 0.031 m² is a jet of 31.8 m/s ... within 10 frames; use an "
-            "opening of 0.097 m², or 0.32 m³/s",
+            "11 fluid[0].emitter[0].flow_rate: 1 m³/s through 0.031 m² is a jet of 31.8 m/s ... within 10 frames; use "
+            "an opening of 0.097 m², or 0.32 m³/s",
         ),
         (
             JET + "ramp = [{ time_s = 1.0, strength = 0.0 }, { time_s = 2.0, strength = 1.0 }]",
@@ -283,8 +283,8 @@ def test_what_an_emitter_cannot_be_is_refused_with_the_number_that_decides(text,
         ),
         (
             WATER.replace("[1.0, 1.0, 0.2]", "[1.0, 1.0, 0.8]").replace("0.1]", "0.4]") + JET.replace("1.0\n", "8.0\n"),
-            "14 fluid[1].emitter[0]: overfills the domain: with it 1.05 m³ are in by 1 s, and there is room for 1 m³; use "
-            "total_volume = 0.2",
+            "14 fluid[1].emitter[0]: overfills the domain: with it 1.05 m³ are in by 1 s, and there is room for 1 m³; "
+            "use total_volume = 0.2",
         ),
     ],
 )
