@@ -36,7 +36,7 @@ def check_fluids(job: Job, solids: Solids, findings: Findings) -> None:
     _check_overlaps(job, solids, findings)
     _check_thin_bodies(job, solids, findings)
     openings: dict[KeyPath, Opening] = {}
-    for index, fluid in enumerate(job.fluid):
+    for index in range(len(job.fluid)):
         _check_speeds(job, index, findings)
         for number, opening in openings_of(job, index, findings):
             path: KeyPath = ("fluid", index, "emitter", number)

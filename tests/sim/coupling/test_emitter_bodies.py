@@ -85,7 +85,7 @@ def test_fluid_leaves_a_falling_body_that_falls_as_without_it(taichi_cpu):
     out_s = time_s - opening.leaves_at(opening.layers_due(time_s) - 1)
     centre = np.array([0.4 * time_s, 0.0, 0.6 + time_s - 0.5 * 9.81 * time_s**2])
     ahead = 0.06 + 0.5 * opening.layer_distance + out_s * 1.0
-    np.testing.assert_allclose(position, centre + [ahead, 0.0, 0.0], atol=0.05 * 2 * RADIUS)
+    np.testing.assert_allclose(position, centre + np.array([ahead, 0.0, 0.0]), atol=0.05 * 2 * RADIUS)
     assert now["particles_emitted"] == 7 * 16  # the volume of a particle is d³ and a little more
 
 
