@@ -3,13 +3,15 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.core.arrays import Integers
+from sim.core.arrays import Integers, Vectors
+from sim.core.bundles import bundle
 from sim.core.cells import CellGrid, Grid, cell_of_point, row_of_cell
 from sim.core.domain import DomainParameters
 from sim.core.launch import kernel
@@ -27,7 +29,23 @@ from sim.shapes.parameters import Placement
 
 FAR_IN_SUPPORTS = 4.0  # how far from the domain pistons wait that have nothing to do
 BLOCKED_IN_SPACINGS = 0.75  # of a spacing, or the distance of layers if less: nearer to another one no particle is put
+REACH_OF_LAST_LAYER = 0.9  # how far in front of its opening the last layer ends as it leaves [layer distances]
 MOUTH_DEPTH_IN_SPACINGS = 0.7  # how far behind the last layer of a wall's samples a mouth reaches that leads through it
+
+
+@bundle
+class Mouth(NamedTuple):
+    """Space in front of an opening, as far as its last layer reaches, and how that moves."""
+
+    centre: ti.math.vec3  # of the opening [m]
+    first: ti.math.vec3  # unit vectors along its axes
+    second: ti.math.vec3
+    along: ti.math.vec3
+    half_first: ti.f32  # half its sides [m]
+    half_second: ti.f32
+    depth: ti.f32  # of the space [m]
+    velocity: ti.math.vec3  # of what is in the middle of the opening [m/s]
+    spin: ti.math.vec3  # angular velocity [rad/s]
 
 
 @dataclass(frozen=True)
@@ -58,7 +76,9 @@ class Emission:
     Particles are free as soon as they have left. What is behind them in the pipe that an opening is the end of is a
     piston: boundary samples, as far from the last layer as those of a wall from fluid at rest, that move on with the
     inflow, and back by a layer when one leaves. Of a wall or body that an opening lies in, the piston stands for the
-    samples in its mouth, which weigh nothing, and stays there when nothing flows.
+    samples in its mouth, which weigh nothing, and stays there when nothing flows. Where a fluid has surface tension its
+    last layer is held until the next one leaves: a piston pushes as a fluid does, and does not pull, and by the pressure
+    that cohesion makes in a jet it would throw it out.
 
     Attributes:
         time_s: simulated time [s].
@@ -123,6 +143,26 @@ class Emission:
     def carry(self, states: BodyStates) -> None:
         """Take where the moving bodies are now."""
         self._states, self._states_s = states, self.time_s
+
+    def hold_last_layers(self, particles: ParticleSet, acceleration: ti.Ndarray) -> None:
+        """Let the last layers of fluids with surface tension move as their pistons do, and not accelerate."""
+        for number, opening in enumerate(self.openings):
+            if self._fluids[self._phase[number]].surface_tension == 0.0 or not opening.inflow.is_open(self.time_s):
+                continue
+            passed, speed = self._since_last_layer(number)
+            motion = self._carrier_motion(number, self.time_s)
+            centre = opening.to_world(np.zeros((1, 3)), motion)
+            axes = rotation.rotated(motion.orientation, opening.axes)
+            first, second = opening.half_size
+            mouth = Mouth(
+                *map(tuple, (centre[0], *axes)),
+                half_first=first,
+                half_second=second,
+                depth=passed + REACH_OF_LAST_LAYER * opening.layer_distance,
+                velocity=tuple(opening.velocity_at(centre, motion, speed)[0]),
+                spin=tuple(motion.angular_velocity),
+            )
+            hold_particles(particles.arrays, acceleration, mouth)
 
     def advance(self, particles: ParticleSet, dt: float, first_id: int) -> int:
         """Put the layers that have left after a step of dt [s] among the particles; returns how many were emitted.
@@ -244,16 +284,17 @@ class Emission:
             corner = np.array(self._domain.max) + FAR_IN_SUPPORTS * self._discretization.support_radius
             return corner, np.eye(3), np.zeros(3), np.zeros(3)
         motion = self._carrier_motion(number, self.time_s)
-        # The last layer is where it got if nothing but the piston moved it.
-        passed, speed = 0.0, 0.0
-        if is_open:
-            left = self._layers[number]
-            gone = 0.0 if left == 0 else left - 1 + opening.count_of(0) / len(opening.places)
-            passed = opening.inflow.travel_at(self.time_s) - gone * opening.layer_distance
-            speed = opening.inflow.speed_at(self.time_s)
+        passed, speed = self._since_last_layer(number) if is_open else (0.0, 0.0)
         centre = opening.to_world(np.array([[0.0, 0.0, 0.5 * opening.layer_distance + passed]]), motion)
         rows = rotation.rotated(motion.orientation, opening.axes)
         return centre[0], rows.T, opening.velocity_at(centre, motion, speed)[0], motion.angular_velocity
+
+    def _since_last_layer(self, number: int) -> tuple[float, float]:
+        """How far the piston has moved since a layer left [m], and its speed [m/s], relative to the opening."""
+        opening, left = self.openings[number], self._layers[number]
+        gone = 0.0 if left == 0 else left - 1 + opening.count_of(0) / len(opening.places)
+        passed = opening.inflow.travel_at(self.time_s) - gone * opening.layer_distance
+        return passed, opening.inflow.speed_at(self.time_s)
 
     def _is_waiting_plug(self, number: int) -> bool:
         """Whether an opening lies in a wall, and is what closes it while nothing flows."""
@@ -306,6 +347,20 @@ class Emission:
         if len(self._fluids) > 1:
             present = int(count_phase(particles.arrays.phase, particles.count, phase))
         return min(room, cap - present)
+
+
+@kernel
+def hold_particles(particles: Particles, acceleration: Vectors, mouth: Mouth):
+    """v_i = that of the opening and its inflow, a_i = 0, for particles in front of it."""
+    for i in range(particles.count):
+        arm = particles.position[i] - mouth.centre
+        depth = arm.dot(mouth.along)
+        is_across = (
+            ti.abs(arm.dot(mouth.first)) < mouth.half_first and ti.abs(arm.dot(mouth.second)) < mouth.half_second
+        )
+        if depth > 0.0 and depth < mouth.depth and is_across:
+            particles.velocity[i] = mouth.velocity + mouth.spin.cross(arm)
+            acceleration[i] = ti.math.vec3(0.0)
 
 
 @kernel

@@ -210,6 +210,7 @@ class ParticleTank:
         `frequency_squared` is that at which each particle can swing against its own pressure [1/s²].
         """
         particles = self.particles
+        self.emission.hold_last_layers(particles, acceleration)
         self.motion = self._stepper.advance(
             particles.position, particles.velocity, acceleration, particles.count, dt, frequency_squared
         )
