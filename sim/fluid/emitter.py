@@ -29,7 +29,7 @@ from sim.shapes.parameters import Placement
 
 FAR_IN_SUPPORTS = 4.0  # how far from the domain pistons wait that have nothing to do
 BLOCKED_IN_SPACINGS = 0.75  # of a spacing, or the distance of layers if less: nearer to another one no particle is put
-REACH_OF_LAST_LAYER = 0.9  # how far in front of its opening the last layer ends as it leaves [layer distances]
+REACH_OF_LAST_LAYER = 0.9  # how far in front of its opening a layer ends as it leaves [layer distances]
 MOUTH_DEPTH_IN_SPACINGS = 0.7  # how far behind the last layer of a wall's samples a mouth reaches that leads through it
 
 

@@ -10,6 +10,7 @@ from pipeline.job.loading import read_job
 from pipeline.kinds.checks.fluid_size import MOST_CELLS, particle_room
 from pipeline.kinds.checks.jets import check_jets
 from pipeline.model.problems import Findings
+from sim.fluid.filling import fill_fluids
 from sim.fluid.opening import Opening
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import PlacedSolid, build_solid
@@ -101,6 +102,18 @@ def test_the_mass_of_a_block_is_told_beside_that_of_its_volume(tmp_path):
     assert fact.path == ("fluid", 0, "block", 0)
     made = findings.elements["fluid"] * 1000.0 * 0.04**3
     assert fact.message == f"holds {made:.3g} kg of water, 27 kg by its volume"
+
+
+@pytest.mark.parametrize("size", ["0.3, 0.3, 0.3", "0.47, 0.33, 0.29"])
+def test_a_preview_has_the_same_mass(size, tmp_path):
+    path = tmp_path / "tank.toml"
+    path.write_text(HEAD + WATER.replace("1.0, 1.0, 0.2", size).replace("0.1]", "0.5]"))
+    masses = []
+    for preview in (False, True):
+        job = read_job(path, preview=preview).job
+        (block,) = fill_fluids(job.fluid, job.domain, []).phase.shape
+        masses.append(block * job.fluid[0].lattice_volume)
+    assert masses[1] == pytest.approx(masses[0], rel=0.01)
 
 
 def test_an_emitter_in_a_solid_body_is_refused(tmp_path):
