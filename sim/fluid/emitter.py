@@ -76,9 +76,10 @@ class Emission:
     Particles are free as soon as they have left. What is behind them in the pipe that an opening is the end of is a
     piston: boundary samples, as far from the last layer as those of a wall from fluid at rest, that move on with the
     inflow, and back by a layer when one leaves. Of a wall or body that an opening lies in, the piston stands for the
-    samples in its mouth, which weigh nothing, and stays there when nothing flows. Where a fluid has surface tension its
-    last layer is held until the next one leaves: a piston pushes as a fluid does, and does not pull, and by the pressure
-    that cohesion makes in a jet it would throw it out.
+    samples in its mouth, which weigh nothing, and stays there when nothing flows.
+
+    A piston pushes as fluid does, and does not pull: by the pressure that cohesion makes in a jet it would throw it
+    out. Where a fluid has surface tension its last layer is held until the next one leaves.
 
     Attributes:
         time_s: simulated time [s].

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sim.fluid.opening import openings_of
-from sim.shapes.packing import Surroundings, pack
+from sim.shapes.filled_volume import Surroundings, pack
 from sim.shapes.placement import build_solid
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from pipeline.model.problems import Findings, Problem
 from sim.core.domain import DomainParameters
 from sim.fluid.filling import surroundings
 from sim.fluid.parameters import FluidParameters
-from sim.shapes.packing import amount
+from sim.shapes.filled_volume import amount
 
 BYTES_PER_PARTICLE, BYTES_PER_PARTICLE_ON_GPU = 1024, 600
 """Upper bounds of what the solvers take, neighbour search included, and on a CPU the snapshots."""

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sim.fluid.kernels import evaluate, particle_volume
-from sim.shapes.packing import Surroundings, amount, pack
+from sim.shapes.filled_volume import Surroundings, amount, pack
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import PlacedSolid, build_solid
 from sim.shapes.solid import ShapeError
