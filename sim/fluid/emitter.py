@@ -323,7 +323,7 @@ class Emission:
         if not len(points):
             return
         for array, rows in ((self._places, points), (self._velocities, velocities)):
-            padded = np.zeros(array.to_numpy().shape, dtype=np.float32)
+            padded = np.zeros((array.shape[0], 3), dtype=np.float32)
             padded[: len(rows)] = rows
             array.from_numpy(padded)
         candidates = Layer(

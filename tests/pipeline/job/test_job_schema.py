@@ -64,11 +64,15 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
-    example, cloth, smoke, limits = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    example, pouring, cloth, smoke, limits = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")
     assert load_job(tmp_path / "limited.toml").limits_of("render").attempts == 5
+    jug = '[[rigid]]\nname = "jug"\nkind = "kinematic"\nshape = { type = "capsule", radius = 0.035, height = 0.11 }\n'
+    poured = example.replace("[[rigid]]", f"{pouring}\n{jug}\n[[rigid]]", 1)
+    (tmp_path / "poured.toml").write_text(poured)
+    assert load_job(tmp_path / "poured.toml").fluid[0].emitter[0].follow == "jug"
     (tmp_path / "flag.toml").write_text(f'name = "flag"\n{cloth}')
     assert len(load_job(tmp_path / "flag.toml").cloth[0].pin) == 2
     car = '[[rigid]]\nname = "car"\nshape = { type = "box", size = [0.4, 0.2, 0.1] }\nposition = [0.0, 0.2, 0.1]\n'
