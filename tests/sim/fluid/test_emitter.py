@@ -332,7 +332,7 @@ def test_a_jet_that_sticks_to_walls_leaves_at_its_speed(taichi_cpu, emitter, dom
     direction, speed = opening_of(emitter).axes[2], emitter["speed"]
     momentum = np.array([now[f"momentum_{axis}"] for axis in "xyz"])
     # Nothing acts on a jet without weight in the air: all that has flowed in has come out, with its momentum. In the
-    # edges of an opening in a floor there is 3 % too much, whose pressure makes 2 % of the speed at the nozzle's end,
+    # edges of an opening in a floor there is 3 % too much, whose pressure makes 2 % of the speed,
     # and as much of it without friction.
     assert now["emission_blocked"] == now["particles_removed"] == 0.0
     np.testing.assert_allclose(momentum, now["mass"] * speed * direction, atol=0.01 * now["mass"] * speed)
@@ -348,7 +348,7 @@ def test_a_viscous_stream_is_held_at_its_opening_by_its_piston(taichi_cpu):
     assert arrays["velocity"][newest, 2].min() > -0.6
 
 
-def test_walls_keep_their_friction_beyond_the_reach_of_a_nozzle(taichi_cpu):
+def test_walls_keep_their_friction_beyond_the_reach_of_an_opening(taichi_cpu):
     wide = DomainParameters(min=(-0.2, -0.2, 0.0), max=(0.2, 0.2, 0.4))
     boundary = jet(FROM_BELOW, domain=wide, **STICKY).boundary
     position, volume, friction = (
