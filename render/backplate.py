@@ -24,7 +24,9 @@ def backplate_size(path: Path) -> tuple[int, int]:
         try:
             with Image.open(file, formats=FORMATS) as image:
                 return image.size
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        except Image.DecompressionBombError as error:
+            raise InvalidFileError(path, "has too many pixels; scale it down") from error
+        except (OSError, ValueError, SyntaxError) as error:
             raise InvalidFileError(path, "is no JPEG or PNG picture") from error
 
 

@@ -176,7 +176,7 @@ WARNINGS = (
     CountedEvent(
         "emission_blocked",
         "particle was not emitted, as its place was taken",
-        "particles were not emitted, as their places were taken",
+        "particles were not emitted, as their places were taken, or outside the domain",
     ),
     CountedEvent("emission_capped", "particle was", "particles were", " not emitted, as there are max_particles"),
     CountedEvent("whitewater_capped", "particle was", "particles were", " not made, as there are max_particles"),

@@ -36,6 +36,12 @@ FORMER = {
 }
 """What to type instead of a command that there was once."""
 
+FORMER_OPTIONS = {
+    "--output": "the farm, the folder of the jobs' folders, is --farm",
+    "--to": "where a result goes is -o",
+}
+"""What to type instead of an option that there was once."""
+
 
 class UnknownCommandError(PipelineError):
     """A word in place of a command is none; says what to type instead."""
@@ -50,6 +56,11 @@ class PipelineGroup(click.Group):
         """Run the command; a `PipelineError` decides the exit code."""
         try:
             return super().invoke(ctx)
+        except click.NoSuchOption as error:
+            if error.option_name not in FORMER_OPTIONS:
+                raise
+            message = f"no such option {error.option_name}: {FORMER_OPTIONS[error.option_name]}"
+            raise click.UsageError(message, error.ctx) from error
         except PipelineError as error:
             for line in str(error).split("\n"):
                 click.secho(f"error: {printable(line)}", err=True, fg="red")

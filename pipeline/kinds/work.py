@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.kinds.base import Work
+from pipeline.kinds.checks.fluid import openings_of
 from pipeline.kinds.checks.steps import stable_dt
 from pipeline.kinds.elements import count_cloth_nodes, most_particles_of
 from pipeline.model.job import Job
@@ -136,17 +137,17 @@ def _fall_speed(job: Job) -> float:
     from sim.shapes.placement import build_solid
 
     points, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for fluid in job.fluid:
+    for index, fluid in enumerate(job.fluid):
         for block in fluid.block:
             low, high = build_solid(block).bounds
             points.append(
                 np.clip(np.array(list(product(*zip(low, high, strict=True)))), job.domain.min, job.domain.max)
             )
             velocities.append(np.tile(block.velocity, (8, 1)))
-        for emitter in fluid.emitter:
-            direction = np.asarray(emitter.direction)
-            points.append(np.array([emitter.position]))
-            velocities.append(np.array([emitter.inflow_speed / np.linalg.norm(direction) * direction]))
+        for _, opening in openings_of(job, index):
+            place, velocity = opening.first_jet
+            points.append(place[None])
+            velocities.append(velocity[None])
     return expected_speed(np.concatenate(points), np.concatenate(velocities), job.domain, job.gravity)
 
 

@@ -46,6 +46,7 @@ class Mouth(NamedTuple):
     depth: ti.f32  # of the space [m]
     velocity: ti.math.vec3  # of what is in the middle of the opening [m/s]
     spin: ti.math.vec3  # angular velocity [rad/s]
+    phase: ti.i32  # number of the fluid
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Emission:
     samples in its mouth, which weigh nothing, and stays there when nothing flows.
 
     A piston pushes as fluid does, and does not pull: by the pressure that cohesion makes in a jet it would throw it
-    out. Where a fluid has surface tension its last layer is held until the next one leaves.
+    out. Where a fluid has surface tension its last layer is held until the next one leaves, while it flows.
 
     Attributes:
         time_s: simulated time [s].
@@ -115,7 +116,7 @@ class Emission:
         self._layers = np.zeros(len(self.openings), dtype=np.int64)
         self._states, self._states_s = at_origin(0), 0.0
         self._is_plug = np.zeros(len(self.openings), dtype=bool)
-        # Of emitters with one opening, one after the other, the first stands for it while none emits.
+        # Emitters that share an opening in turn share one plug: the first one's.
         self._stands_in = [
             next(k for k, each in enumerate(self.openings) if each is own or is_same_opening(each, own, self._spacing))
             for own in self.openings
@@ -151,6 +152,8 @@ class Emission:
             if self._fluids[self._phase[number]].surface_tension == 0.0 or not opening.inflow.is_open(self.time_s):
                 continue
             passed, speed = self._since_last_layer(number)
+            if speed == 0.0:
+                continue
             motion = self._carrier_motion(number, self.time_s)
             centre = opening.to_world(np.zeros((1, 3)), motion)
             axes = rotation.rotated(motion.orientation, opening.axes)
@@ -162,6 +165,7 @@ class Emission:
                 depth=passed + REACH_OF_LAST_LAYER * opening.layer_distance,
                 velocity=tuple(opening.velocity_at(centre, motion, speed)[0]),
                 spin=tuple(motion.angular_velocity),
+                phase=self._phase[number],
             )
             hold_particles(particles.arrays, acceleration, mouth)
 
@@ -352,14 +356,14 @@ class Emission:
 
 @kernel
 def hold_particles(particles: Particles, acceleration: Vectors, mouth: Mouth):
-    """v_i = that of the opening and its inflow, a_i = 0, for particles in front of it."""
+    """v_i = that of the opening and its inflow, a_i = 0, for particles of its fluid in front of it."""
     for i in range(particles.count):
         arm = particles.position[i] - mouth.centre
         depth = arm.dot(mouth.along)
         is_across = (
             ti.abs(arm.dot(mouth.first)) < mouth.half_first and ti.abs(arm.dot(mouth.second)) < mouth.half_second
         )
-        if depth > 0.0 and depth < mouth.depth and is_across:
+        if particles.phase[i] == mouth.phase and depth > 0.0 and depth < mouth.depth and is_across:
             particles.velocity[i] = mouth.velocity + mouth.spin.cross(arm)
             acceleration[i] = ti.math.vec3(0.0)
 

@@ -16,7 +16,7 @@ ROUND_OFF = 1.0e-9  # of a length, by which it may fall short of what it is mean
 class Inflow:
     """Speed of the fluid in an opening over time: linear between times, and what that comes to.
 
-    Before the first time nothing flows, after the last the speed stays.
+    Before the first time nothing flows, after the last the speed stays. One that is 0 for good has ended.
     """
 
     times: NDArray[np.float64]  # ascending, from its start on [s], (n,)
@@ -39,7 +39,10 @@ class Inflow:
         speeds = speed * np.interp(times, given_times, given)
         steps = 0.5 * (speeds[1:] + speeds[:-1]) * np.diff(times)
         endless = cls(times, speeds, np.concatenate([[0.0], np.cumsum(steps)]), math.inf)
-        stop_s = min(math.inf if end_s is None else end_s, endless.time_of(most))
+        flowing = np.flatnonzero(speeds)
+        last = flowing[-1] + 1 if len(flowing) else 0
+        dry_s = float(times[last]) if last < len(times) else math.inf
+        stop_s = min(math.inf if end_s is None else end_s, endless.time_of(most), dry_s)
         return cls(times, speeds, endless.travels, stop_s)
 
     @property
@@ -55,9 +58,7 @@ class Inflow:
     @property
     def total_travel(self) -> float:
         """How far the fluid comes in all [m]; infinite where it never stops."""
-        if math.isinf(self.end_s):
-            return math.inf if self.speeds[-1] > 0.0 else float(self.travels[-1])
-        return self.travel_at(self.end_s)
+        return math.inf if math.isinf(self.end_s) else self.travel_at(self.end_s)
 
     def is_open(self, time_s: float) -> bool:
         """Whether it has begun by a time [s] and has not ended."""

@@ -335,12 +335,17 @@ def _axes_along(direction: Sequence[float]) -> NDArray[np.float64]:
 
 
 def is_same_opening(one: Opening, other: Opening, spacing: float) -> bool:
-    """Whether two emitters have one opening that rests, as when an inflow changes its speed."""
+    """Whether two emitters have one opening that rests, or rests on one body, as when an inflow changes its speed."""
     return (
-        not (one.moves or other.moves)
+        _move_alike(one, other)
         and one.places.shape == other.places.shape
         and bool(np.allclose(one.points(1), other.points(1), rtol=0.0, atol=SAME_IN_SPACINGS * spacing))
     )
+
+
+def _move_alike(one: Opening, other: Opening) -> bool:
+    """Whether two openings always are where they are at the start, as seen from each other."""
+    return one.path is None and other.path is None and one.follow == other.follow
 
 
 def opening_collision(one: Opening, other: Opening, name: str, spacing: float) -> str | None:
@@ -348,7 +353,7 @@ def opening_collision(one: Opening, other: Opening, name: str, spacing: float) -
 
     Layers that leave one must not be where those of the other do at the same time, as they would take their places.
     """
-    if one.moves or other.moves or one.start_s >= other.end_s or other.start_s >= one.end_s:
+    if not _move_alike(one, other) or one.start_s >= other.end_s or other.start_s >= one.end_s:
         return None
     if is_same_opening(one, other, spacing):
         return f"is the same opening as {name}, at the same time; let one start when the other has ended"
@@ -366,9 +371,11 @@ def opening_problem(
 ) -> str | None:
     """Why an opening cannot be where it is, or None: it is not free, or in the way of an earlier one.
 
-    The earlier ones are named as messages call them. Of one that moves only the start counts, if it is on a path.
+    The earlier ones are named as messages call them. Of one that moves only the start counts, and not if it follows a
+    body that has time to carry it elsewhere before it begins.
     """
-    reason = None if opening.follow is not None else obstruction(opening, spacing, domain, solids)
+    is_elsewhere = opening.follow is not None and opening.start_s > 0.0
+    reason = None if is_elsewhere else obstruction(opening, spacing, domain, solids)
     for name, other in earlier.items():
         reason = reason or opening_collision(opening, other, name, spacing)
     return reason

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.shapes.parameters import Shape
+from sim.shapes.parameters import MeshShape, Shape
 from sim.shapes.placement import build_rest_shape
 from sim.shapes.solid import ShapeError
 
@@ -25,13 +26,20 @@ class Section:
     area: float  # [m²]
 
 
-@cache
 def section_of(shape: Shape) -> Section:
     """The section of a shape about its own origin.
 
     Raises:
         ShapeError: the shape cannot be built, or the plane misses it.
+        OSError: its file cannot be read.
     """
+    status = Path(shape.file).stat() if isinstance(shape, MeshShape) else None
+    return _section_of(shape, None if status is None else (status.st_size, status.st_mtime_ns))
+
+
+@lru_cache(maxsize=32)
+def _section_of(shape: Shape, _state: tuple[int, int] | None) -> Section:
+    """The section of a shape, and of the state of its file."""
     rest = build_rest_shape(shape)
     directions = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
     half = rest.support(directions).reshape(2, 2).max(axis=1)

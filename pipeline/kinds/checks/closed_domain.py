@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.kinds.base import Solids
+from pipeline.kinds.checks.fluid import openings_of
 from pipeline.model.boxes import Box, overlap, smoke_box
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
@@ -42,9 +43,10 @@ def check_closed_domain(job: Job, smoke: SmokeParameters, solids: Solids, findin
                     f"and {_must_flow(flow)}",
                 )
     for index, fluid in enumerate(job.fluid):
-        for number, emitter in enumerate(fluid.emitter):
-            filled = min(emitter.emitted_volume(job.film_s), fluid.most_volume) / room
-            is_inside = np.all((box[0] <= emitter.position) & (emitter.position <= box[1]))
+        for number, opening in openings_of(job, index):
+            filled = min(fluid.emitter[number].emitted_volume(job.film_s), fluid.most_volume) / room
+            place, _ = opening.first_jet
+            is_inside = np.all((box[0] <= place) & (place <= box[1]))
             if is_inside and filled > SQUEEZED:
                 findings.warn(
                     ("fluid", index, "emitter", number),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,23 +44,25 @@ def _check_domain(job: Job, solids: Solids, openings: Mapping[KeyPath, Opening],
     room = math.prod((box[1] - box[0]).tolist())
     room -= sum(solid.volume * overlap(solid.bounds, box) for place, solid in solids.items() if place[0] == "rigid")
     filled = sum(solid.volume * overlap(solid.bounds, box) for place, solid in solids.items() if place[0] == "fluid")
+    way_out = "or it runs over the open top" if job.domain.open_faces else "or open a face"
+    earlier: list[KeyPath] = []
     for path in openings:
-        filled += _poured(job, path)
-        if filled > room:
+        earlier.append(path)
+        inside = filled + _poured(job, earlier)
+        if inside > room:
             findings.warn(
                 path,
-                f"overfills the domain: with it {filled:.3g} m³ are in by {job.film_s:g} s, and there is room for "
-                f"{room:.3g} m³; {_remedy(job, path, filled - room)}, or open a face",
+                f"overfills the domain: with it {inside:.3g} m³ are in by {job.film_s:g} s, and there is room for "
+                f"{room:.3g} m³; {_remedy(job, path, inside - room)}, {way_out}",
             )
 
 
 def _check_vessel(job: Job, vessel: KeyPath, paths: list[KeyPath], solids: Solids, findings: Findings) -> None:
-    solid, low, high = solids[vessel], *_cavity(solids[vessel])[1:]
-    room = _cavity(solid)[0]
+    room, low, high = _cavity(solids[vessel])
     inside = np.stack([low, high])
     filled = sum(
         each.volume * overlap(each.bounds, inside) for place, each in solids.items() if place[0] == "fluid"
-    ) + sum(_poured(job, path) for path in paths)
+    ) + _poured(job, paths)
     if filled > (1.0 + BRIM) * room:
         path = paths[-1]
         findings.warn(
@@ -70,14 +72,16 @@ def _check_vessel(job: Job, vessel: KeyPath, paths: list[KeyPath], solids: Solid
         )
 
 
-def _poured(job: Job, path: KeyPath) -> float:
-    """Volume that an emitter brings in the film [m³]."""
-    fluid = job.fluid[int(path[1])]
-    return min(fluid.emitter[int(path[3])].emitted_volume(job.film_s), fluid.most_volume)
+def _poured(job: Job, paths: Sequence[KeyPath]) -> float:
+    """Volume that emitters bring in the film [m³], of each fluid its cap at most."""
+    volumes = dict.fromkeys((int(path[1]) for path in paths), 0.0)
+    for path in paths:
+        volumes[int(path[1])] += job.fluid[int(path[1])].emitter[int(path[3])].emitted_volume(job.film_s)
+    return sum(min(volume, job.fluid[index].most_volume) for index, volume in volumes.items())
 
 
 def _remedy(job: Job, path: KeyPath, excess: float) -> str:
-    left = _poured(job, path) - excess
+    left = _poured(job, [path]) - excess
     return f"use total_volume = {rounded_down(left):g}" if left > 0.0 else "leave it out"
 
 
@@ -101,7 +105,7 @@ def _vessel_under(job: Job, opening: Opening, solids: Solids) -> KeyPath | None:
     return min(found)[1] if found else None
 
 
-@cache
+@lru_cache(maxsize=16)
 def _cavity(solid: PlacedSolid) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Volume that stays in a body [m³] when it is filled to the brim from above, and the corners of a box around that.
 

@@ -15,7 +15,7 @@ class KeyframeParameters(Parameters):
     """Where something on a path is at one time."""
 
     time_s: NonNegative = Field(description="Time [s]; later than that of the keyframe before.")
-    position: Vector3 = Field(description="World position of the shape's centre [m].")
+    position: Vector3 = Field(description="Position of the centre in the world [m].")
     rotation_deg: Vector3 = Field(
         default=(0.0, 0.0, 0.0),
         description="Rotation about x, then y, then z (world axes) [degrees]; "

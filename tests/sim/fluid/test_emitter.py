@@ -11,10 +11,13 @@ from small_fluids import EVERY_FACE, lattice, make_fluid
 from sim.build import build_world
 from sim.core.cells import CellGrid, CellSort
 from sim.core.domain import DomainParameters
+from sim.fluid.boundary_akinci2012 import domain_wall_samples
 from sim.fluid.emitter import find_free_places
-from sim.fluid.opening import Opening, obstruction, opening_collision
-from sim.fluid.parameters import EmitterParameters
+from sim.fluid.opening import Opening, is_same_opening, obstruction, opening_collision
+from sim.fluid.parameters import EmitterParameters, FluidParameters
 from sim.fluid.particles import Layer, Particles
+from sim.fluid.tank import FluidStart
+from sim.fluid.wcsph import WCSPHSolver
 from sim.scene import SceneParameters
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
@@ -258,6 +261,16 @@ def test_emitters_in_each_others_way_are_refused(other, reason):
         build_world(scene, frames_per_second=60)
 
 
+def test_openings_on_one_body_are_as_those_at_rest():
+    first, later = ({**SIDE, "follow": "jug", "start_s": start_s} for start_s in (0.0, 1.0))
+    first["end_s"] = 1.0
+    assert is_same_opening(opening_of(first), opening_of(later), SPACING)
+    both = opening_collision(opening_of({**first, "end_s": 2.0}), opening_of(later), "the other", SPACING)
+    assert "is the same opening as the other, at the same time" in both
+    assert opening_collision(opening_of(first), opening_of(later), "the other", SPACING) is None
+    assert not is_same_opening(opening_of(first), opening_of({**later, "follow": "mug"}), SPACING)
+
+
 @pytest.mark.parametrize(
     "other",
     [
@@ -400,3 +413,43 @@ def test_surface_tension_does_not_throw_a_jet_out(taichi_cpu, solver, tension):
     now = fluid.diagnostics()
     assert 0.75 < now["momentum_x"] / (0.3 * now["mass"]) < 1.01
     assert now["emission_blocked"] == 0.0
+
+
+def test_the_last_layer_is_not_held_when_nothing_flows_any_more(taichi_cpu):
+    tap = {"shape": {"type": "disc", "radius": 0.04}, "position": (0, 0, 0.4), "direction": (0, 0, -1), "speed": 0.5}
+    dry = [{"time_s": 0.0, "strength": 1.0}, {"time_s": 0.1, "strength": 0.0}]
+    fluid = make_fluid(
+        DomainParameters(min=(-0.2, -0.2, -1.0), max=(0.2, 0.2, 0.5)),
+        NOTHING,
+        emitter=({**tap, "ramp": dry},),
+        capacity=400,
+        surface_tension=0.07,
+        particle_radius=0.5 * SPACING,
+    )
+    run(fluid, 0.4)
+    heights = fluid.snapshots()["water"].arrays["position"][:, 2]
+    assert len(heights)
+    assert heights.max() < 0.2  # all fall for 0.3 s at least
+
+
+def test_a_fluid_in_front_of_anothers_opening_is_not_held(taichi_cpu):
+    """Oil beneath a tap of water with surface tension flows as if the tap were not."""
+    tap = {"shape": {"type": "disc", "radius": 0.04}, "position": (0, 0, 0.2), "direction": (0, 0, -1), "speed": 1e-3}
+    domain = DomainParameters(min=(-0.2, -0.2, 0.0), max=(0.2, 0.2, 0.5))
+    oil = {"name": "oil", "particle_radius": 0.5 * SPACING, "block": ({"shape": {"type": "box", "size": (1, 1, 1)}},)}
+    water = {"name": "water", "particle_radius": 0.5 * SPACING, "emitter": (tap,), "surface_tension": 0.07}
+    fluids = tuple(FluidParameters.model_validate(each) for each in (oil, water))
+    beneath = lattice((-0.06, -0.06, 0.2 - SPACING), (0.06, 0.06, 0.2), SPACING)
+    start = FluidStart(
+        fluids,
+        domain=domain,
+        gravity=(0.0, 0.0, -9.81),
+        positions=beneath,
+        velocities=np.zeros_like(beneath),
+        boundary=domain_wall_samples(domain, SPACING),
+        phase=np.zeros(len(beneath), dtype=np.int32),
+        capacity=len(beneath) + 400,
+    )
+    fluid = WCSPHSolver(start)
+    run(fluid, 0.05)
+    assert fluid.snapshots()["oil"].arrays["velocity"][:, 2].max() < -0.2

@@ -66,6 +66,25 @@ def test_the_amount_is_right_to_a_layer_at_any_time_and_to_a_particle_at_the_end
         assert own.layers_due(time_s + 1e-9) == layer + 1
 
 
+@pytest.mark.parametrize(
+    ("points", "dry_s"),
+    [
+        ([(0.0, 1.0), (0.5, 0.0)], 0.5),
+        ([(0.1, 0.3), (0.3, 0.7), (0.4, 0.0), (2.0, 0.0)], 0.4),
+        ([(0.0, 0.0)], 0.0),
+    ],
+)
+def test_an_inflow_that_runs_dry_has_ended(points, dry_s):
+    """Every particle has come out then: none waits for more."""
+    ramp = [{"time_s": time_s, "strength": strength} for time_s, strength in points]
+    for speed in np.linspace(0.3, 1.7, 15):
+        keys = {"speed": float(speed), "ramp": ramp}
+        emitter, own = EmitterParameters.model_validate({**SPOUT, **keys}), opening(**keys)
+        volume = emitter.emitted_volume(math.inf)
+        assert own.end_s == dry_s
+        assert own.particles_due(own.end_s) == own.total_particles == pytest.approx(volume / SPACING**3, abs=0.5)
+
+
 def test_a_flow_rate_is_a_speed_by_the_area():
     emitter = EmitterParameters.model_validate({**SPOUT, "flow_rate": 0.001})
     assert emitter.inflow_speed == pytest.approx(0.001 / (math.pi * 0.03**2))

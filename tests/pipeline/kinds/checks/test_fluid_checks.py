@@ -346,3 +346,23 @@ def test_the_limit_is_that_of_the_simulation():
     from sim.core.cells import MAX_CELLS
 
     assert MOST_CELLS == MAX_CELLS
+
+
+def test_an_emitter_that_runs_dry_is_counted(tmp_path):
+    """A ramp that ends at 0, without end_s, had no number of particles."""
+    text = HEAD + JET + "ramp = [{ time_s = 0.0, strength = 1.0 }, { time_s = 0.5, strength = 0.0 }]"
+    errors, _, _ = checked(text, tmp_path / "tank.toml")
+    assert errors == []
+    job = read_job(tmp_path / "tank.toml").job
+    assert particle_room(job, 0, 0.0) == pytest.approx(np.pi * 0.01 * 0.25 / 0.04**3, abs=1)
+
+
+@pytest.mark.parametrize(("cap", "is_warned_of"), [("", True), ("max_particles = 600\n", False)])
+def test_the_cap_of_a_fluid_is_of_all_its_emitters(cap, is_warned_of, tmp_path):
+    """Two of 0.031 m³ each, or of 0.038 m³ in all, where there is room for 0.05."""
+    water = WATER.replace("[1.0, 1.0, 0.2]", "[1.0, 1.0, 0.95]").replace("0.1]", "0.475]")
+    head, emitter = JET.replace("0.0, 0.0, 0.9", "-0.25, 0.0, 0.98").split("[[fluid.emitter]]")
+    emitters = [emitter, emitter.replace("-0.25", "0.25")]
+    text = HEAD + water + head + cap + "".join("[[fluid.emitter]]" + each for each in emitters)
+    _, warnings, _ = checked(text, tmp_path / "tank.toml")
+    assert any("overfills the domain" in warning for warning in warnings) == is_warned_of
