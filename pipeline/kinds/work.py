@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.kinds.base import Work
-from pipeline.kinds.checks.fluid import openings_of
 from pipeline.kinds.checks.steps import stable_dt
 from pipeline.kinds.elements import count_cloth_nodes, most_particles_of
 from pipeline.model.job import Job
@@ -134,6 +133,7 @@ def _stiffest(job: Job) -> float:
 
 def _fall_speed(job: Job) -> float:
     """Largest speed [m/s] of what falls from the top of a block, or out of an opening, to the domain's floor."""
+    from pipeline.kinds.checks.fluid import openings_of
     from sim.shapes.placement import build_solid
 
     points, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
