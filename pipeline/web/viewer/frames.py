@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.base.errors import InvalidArtifactError
+from pipeline.base.errors import InvalidArtifactError, MissingInputError
 from pipeline.base.layout import JobLayout
 from pipeline.model.job import Job
 from pipeline.stages.render_scene import camera_path, framed_points
@@ -99,7 +99,7 @@ def _view(
         return None
     try:
         path = camera_path(job, framed_points(job, layout))
-    except (InvalidFileError, InvalidArtifactError, OSError):
+    except (InvalidFileError, InvalidArtifactError, MissingInputError, OSError):
         return None
     poses = {name: body.position.tolist() for name, body in bodies.items() if isinstance(body, Pose)}
     if any(name not in poses for name in path.bodies):

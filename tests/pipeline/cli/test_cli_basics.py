@@ -53,6 +53,7 @@ def test_new_writes_a_file_that_check_accepts(in_tmp_path):
         "films/my-film.toml: ok",
         "  my-film: 180 frames, 3 s at 60 fps",
         "  393,216 smoke cells",
+        '  smoke[0] "plume" as smoke: optical depth 2.5 across its source, density 18.9',
         "  960 x 540 pixels, preview quality",
     ]
     assert "of disk" in cost

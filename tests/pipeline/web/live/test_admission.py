@@ -45,7 +45,7 @@ def test_the_drop_to_start_from_is_let_in(tmp_path, monkeypatch):
 
 def test_honey_is_told_by_what_flows_in_during_the_film_and_what_its_viscosity_takes(monkeypatch):
     told = told_of(monkeypatch, str(JOBS / "honey.toml"))
-    assert "honey is too large to steer: about 13,440 particles at 7 steps a frame" in told
+    assert "honey is too large to steer: about 13,408 particles at 7 steps a frame" in told
     honey = live_job(load_job(JOBS / "honey.toml"))
     thin = honey.model_copy(update={"fluid": (honey.fluid[0].model_copy(update={"viscosity": 1e-6}),)})
     step_s = [fluid_frame_s(job, 3360, power=1) / steps_a_frame(job) for job in (honey, thin)]
