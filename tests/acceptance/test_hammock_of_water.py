@@ -23,9 +23,9 @@ COARSE = (
 SECONDS = 2.0
 """The jet throws up nothing more once the bag is as full as it is by then."""
 
-MOST_OVER_THE_RIM = 0.03
-"""Of the particles: drops that splash, which are few: 3 to 8 of some 400, with any damping of the cloth up to 0.1 s. A
-jet that runs up the sheet loses a twentieth."""
+MOST_OVER_THE_RIM = 8
+"""Particles: drops that splash, which are few, 3 to 8 of some 400, with any damping of the cloth up to 0.1 s. A jet
+that runs up the sheet loses 20."""
 
 
 @pytest.mark.slow
@@ -45,7 +45,7 @@ def test_the_hammock_holds_what_is_poured_into_it():
         held = set(number[below % 2 == 1].tolist())
     assert not fallen_through
     poured = number.max() + 1  # also those that have left the domain
-    assert poured - len(held) < MOST_OVER_THE_RIM * poured
+    assert poured - len(held) <= MOST_OVER_THE_RIM
 
 
 def sheets_below_and_above(

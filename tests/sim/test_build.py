@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from sim.build import build_world
 from sim.fluid.filling import fill_fluids
+from sim.fluid.kernels import evaluate, particle_volume
 from sim.rigid.states import StaticBody
 from sim.scene import SceneParameters
 
@@ -61,14 +62,28 @@ def test_particles_inside_a_solid_are_left_out():
     assert np.linalg.norm(with_ball.positions - [0, 0, 0.5], axis=1).min() >= 0.1 + 0.999 * SPACING / 2 - 1e-6
 
 
-def test_overlapping_blocks_share_no_place():
-    shifted = box((0.2, 0.2, 0.2), (0.053, 0.011, 0.507))
-    result = filling(scene(box((0.2, 0.2, 0.2), (0, 0, 0.5)), shifted))
+@pytest.mark.parametrize(
+    ("corner", "shared", "nearest", "densest"),
+    [
+        ((0.053, 0.011, 0.507), 0.147 * 0.189 * 0.193, 0.9, 1.01),
+        ((0.101, 0.099, 0.51), 0.099 * 0.101 * 0.19, 0.9, 1.04),
+        ((0.08, 0.083, 0.57), 0.12 * 0.117 * 0.13, 0.75, 1.04),
+        ((0.037, 0.1, 0.55), 0.163 * 0.1 * 0.15, 0.9, 1.09),
+    ],
+)
+def test_overlapping_blocks_share_no_place(corner, shared, nearest, densest):
+    """Nor is fluid much denser where they meet: the corner of a full box between walls has 1.06."""
+    result = filling(scene(box((0.2, 0.2, 0.2), (0, 0, 0.5)), box((0.2, 0.2, 0.2), corner)))
     # Of both together, without what they share.
-    assert len(result.positions) == pytest.approx(2000 - 0.147 * 0.189 * 0.193 / SPACING**3, rel=2e-3)
-    distance, _ = cKDTree(result.positions).query(result.positions, k=2)
-    assert distance[:, 1].min() >= 0.6 * SPACING
-    assert np.percentile(distance[:, 1], 2) >= 0.8 * SPACING
+    assert len(result.positions) == pytest.approx(2000 - shared / SPACING**3, rel=2e-3)
+    positions = result.positions.astype(np.float64)
+    distance, _ = cKDTree(positions).query(positions, k=2)
+    assert distance[:, 1].min() >= nearest * SPACING - 1e-6
+    pairs = cKDTree(positions).query_pairs(2.0 * SPACING, output_type="ndarray")
+    apart = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
+    weights = np.bincount(pairs.T.ravel(), np.tile(evaluate(apart, 2.0 * SPACING), 2), minlength=len(positions))
+    density = particle_volume(SPACING) * (evaluate(0.0, 2.0 * SPACING) + weights)
+    assert density.max() < densest
 
 
 def test_each_block_keeps_its_own_velocity():

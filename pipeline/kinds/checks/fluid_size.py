@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.fluid import openings_of
 from pipeline.kinds.checks.memory_budget import MemoryBudget
-from pipeline.model.amounts import count, gigabytes, rounded_up
+from pipeline.model.amounts import count, gigabytes, rounded_down, rounded_up
 from pipeline.model.boxes import ALL, domain_box, overlap, span
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
@@ -101,11 +101,11 @@ def _check_block(job: Job, path: KeyPath, solids: Solids, findings: Findings) ->
     held, outside_walls = (
         amount(solid, fluid.spacing, surroundings(job.domain, walls, others)) for others in (earlier, [])
     )
+    thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
     kept_out = round(held.of_solid) - outside_walls.particles
     if not held.particles and kept_out:
         findings.error(path, "lies wholly inside solid bodies, so it holds no particle; move it")
     elif not held.particles:
-        thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
         findings.error(
             path,
             f"holds no particle: it is {thinnest:.3g} m thin and particles are {fluid.spacing:.3g} m apart; "
@@ -114,6 +114,12 @@ def _check_block(job: Job, path: KeyPath, solids: Solids, findings: Findings) ->
     elif kept_out:
         filled = count(round(held.of_solid))
         findings.warn(path, f"overlaps a solid body: {count(kept_out)} of its {filled} particles are left out")
+    if held.particles and thinnest < (1.0 - 1.0e-6) * fluid.spacing:
+        findings.warn(
+            path,
+            f"is {thinnest:.3g} m thin and particles are {fluid.spacing:.3g} m apart: they have its mass, not its "
+            f"shape; use a particle_radius of {rounded_down(0.5 * thinnest):g} m or less",
+        )
     made, meant = (fluid.rest_density * volume for volume in (held.particles * fluid.lattice_volume, held.volume))
     if held.particles:
         findings.facts.append(Problem(path, f"holds {made:.3g} kg of {fluid.name}, {meant:.3g} kg by its volume"))

@@ -5,27 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from checked_jobs import checked, says
+from checked_jobs import PLUME_FROM_A_BALL, checked, says
 
-SCENE = """
-name = "film"
-frames = 2
-[domain]
-min = [-0.5, -0.5, 0.0]
-max = [0.5, 0.5, 1.0]
+SCENE = (
+    PLUME_FROM_A_BALL
+    + """
 [[fluid]]
 name = "water"
 particle_radius = 0.02
 [[fluid.block]]
 shape = { type = "box", size = [0.4, 0.4, 0.4] }
 position = [0.0, 0.0, 0.3]
-[[smoke]]
-name = "plume"
-cell_size = 0.05
-[[smoke.source]]
-shape = { type = "sphere", radius = 0.1 }
-position = [0.2, 0.2, 0.8]
 """
+)
 
 
 def findings(folder: Path, keys: str = "") -> tuple[list[str], list[str]]:
@@ -58,12 +50,12 @@ def test_the_optical_depth_of_each_liquid_and_smoke_is_told(tmp_path):
 def test_a_density_that_is_not_seen_or_lets_nothing_through_is_warned_of(tmp_path, keys, expected):
     (warning,), _ = findings(tmp_path, f"[material]\n{keys}")
     name = keys.partition(".")[0].partition(" ")[0]
-    assert says(warning, f"film.toml:20 material.{name}.density: {expected}")
+    assert says(warning, f"film.toml:22 material.{name}.density: {expected}")
 
 
 def test_the_table_that_gives_a_density_to_many_bodies_is_the_one_that_is_told(tmp_path):
     (warning,), _ = findings(tmp_path, '[material."plum*"]\ndensity = 0.3')
-    assert warning.startswith('film.toml:20 material."plum*".density: ')
+    assert warning.startswith('film.toml:22 material."plum*".density: ')
 
 
 def test_clear_water_and_thick_milk_are_meant(tmp_path):

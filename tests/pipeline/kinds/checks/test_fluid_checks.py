@@ -357,6 +357,15 @@ def test_an_emitter_that_runs_dry_is_counted(tmp_path):
     assert particle_room(job, 0, 0.0) == pytest.approx(np.pi * 0.01 * 0.25 / 0.04**3, abs=1)
 
 
+def test_a_block_thinner_than_a_particle_has_its_mass_and_not_its_shape(tmp_path):
+    for thin, is_warned_of in ((0.01, True), (0.04, False)):
+        text = HEAD + WATER.replace("[1.0, 1.0, 0.2]", f"[1.0, 1.0, {thin}]")
+        errors, warnings, _ = checked(text, tmp_path / "tank.toml")
+        told = "fluid[0].block[0]: is 0.01 m thin and particles are 0.04 m apart: they have its mass, not its shape"
+        assert errors == []
+        assert any(f"{told}; use a particle_radius of 0.005 m or less" in each for each in warnings) == is_warned_of
+
+
 @pytest.mark.parametrize(("cap", "is_warned_of"), [("", True), ("max_particles = 600\n", False)])
 def test_the_cap_of_a_fluid_is_of_all_its_emitters(cap, is_warned_of, tmp_path):
     """Two of 0.031 m³ each, or of 0.038 m³ in all, where there is room for 0.05."""
