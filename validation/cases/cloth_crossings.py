@@ -361,10 +361,11 @@ def draw(results: Sequence[CaseResult]) -> Figure:
     ):
         for number, name in enumerate(SCENES):
             values = series[f"{name}: {key}"]
-            style = "-" if number < len(SHADES) else ":"
-            axes.plot(values, style, color=SHADES[number % len(SHADES)], linewidth=1.0, label=name)
-        label_axes(axes, "frame", label, legend=key == "strain")
+            style, shade = divmod(number, len(SHADES))
+            axes.plot(values, ("-", ":", "--")[style], color=SHADES[shade], linewidth=1.0, label=name)
+        label_axes(axes, "frame", label, legend=False)
     panels[2].set_yscale("log")  # a pellet takes a hundred times as many
+    figure.legend(handles=panels[0].get_lines(), loc="outside right center")
     return figure
 
 
