@@ -25,7 +25,8 @@ from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, 
 from sim.fluid.emitter import Carrier
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.kernels import Discretization
-from sim.fluid.opening import Opening, opening_problem, openings_of
+from sim.fluid.opening import Opening, openings_of
+from sim.fluid.opening_conflicts import opening_problem
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart

@@ -22,7 +22,8 @@ from sim.core.scan import exclusive_scan, scan_scratch_length
 from sim.fluid.boundary import BodyStates, at_origin
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.kernels import Discretization, wall_layers
-from sim.fluid.opening import is_same_opening, openings_of
+from sim.fluid.opening import openings_of
+from sim.fluid.opening_conflicts import is_same_opening
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Layer, Particles, ParticleSet
 from sim.shapes.parameters import Placement

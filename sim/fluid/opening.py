@@ -1,11 +1,10 @@
-"""The openings of emitters: the layers of particles in them, where these leave, and what is in the way."""
+"""The openings of emitters: which layers of particles leave them, when, where and how fast."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,20 +13,14 @@ from scipy.spatial import cKDTree
 
 from sim.core.motion import rotation
 from sim.core.motion.paths import KeyframePath, Motion, path_through
-from sim.fluid.parameters import DiscOpening, RectangleOpening
-from sim.shapes.section import Section, section_of
+from sim.fluid.opening_layers import best_layer
+from sim.fluid.parameters import RectangleOpening
 
 if TYPE_CHECKING:
-    from sim.core.domain import DomainParameters
     from sim.fluid.inflow import Inflow
     from sim.fluid.parameters import EmitterParameters, FluidParameters
     from sim.shapes.parameters import Placement
-    from sim.shapes.solid import Solid
 
-NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35  # of particles and of layers: nearer, they would burst out
-LATTICE_CONSTANTS = 1.1, 0.9  # spacings of lattices that are cut to an opening [spacings], largest and smallest
-LATTICES_TRIED = 41  # of them
-SAME_IN_SPACINGS = 1.0e-3  # openings whose particles differ by less are one
 MOUTH_IN_SPACINGS = 0.75  # how far from a place in an opening samples of a wall are in its mouth
 MANY = 2**53  # particles or layers that no emitter comes to
 
@@ -63,7 +56,7 @@ class Opening:
         Raises:
             ValueError: it is too narrow for them; as a ShapeError where its shape cannot be built.
         """
-        layer = _best_layer(emitter, spacing, particle_volume)
+        layer = best_layer(emitter.shape, emitter.area, spacing, particle_volume)
         if layer is None:
             raise ValueError(
                 f"is too narrow for particles {spacing:g} m apart; enlarge it or use a smaller particle_radius"
@@ -232,88 +225,12 @@ def placed_on(emitter: EmitterParameters, body: Placement) -> EmitterParameters:
     return emitter.model_copy(update={**update, "follow": None})
 
 
-def obstruction(opening: Opening, spacing: float, domain: DomainParameters, solids: Sequence[Solid]) -> str | None:
-    """Why fluid cannot enter here, or None: particles of the opening outside the domain, or in a solid."""
-    points = opening.points(1, opening.start_s)
-    outside = ((points < domain.min) | (points > domain.max)).any(axis=1)
-    if outside.any():
-        return (
-            f"{np.count_nonzero(outside)} of the {len(outside)} places of its opening are outside the domain; "
-            "move it in, or let it point inwards"
-        )
-    inside = np.zeros(len(points), dtype=bool)
-    for solid in solids:
-        inside |= solid.signed_distance(points) < 0.25 * spacing
-    if inside.any():
-        return f"{np.count_nonzero(inside)} of the {len(inside)} places of its opening are in a solid body; move it out"
-    return None
-
-
 def _motion_of(body: Placement | None) -> Motion:
     """A body's pose at the start, at rest; the world's own where there is none."""
     if body is None:
         return Motion(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3))
     orientation = rotation.from_degrees(body.rotation_deg)
     return Motion(np.array(body.position, dtype=np.float64), orientation, np.zeros(3), np.zeros(3))
-
-
-def _best_layer(
-    emitter: EmitterParameters, spacing: float, particle_volume: float
-) -> tuple[NDArray[np.float64], float] | None:
-    """Places in the plane of the opening [m], (n, 2), and distance of layers [m], which keep particles farthest apart.
-
-    None where all are too near or too far.
-    """
-    shape, area = emitter.shape, emitter.area
-    if isinstance(shape, RectangleOpening):
-        layers = _rectangle_layers(shape.size, spacing)
-    elif isinstance(shape, DiscOpening):
-        layers = _cut_layers(_disc(shape.radius), area, spacing)
-    else:
-        layers = _cut_layers(section_of(shape), area, spacing)
-    best, farthest = None, 0.0
-    for places, nearest in layers:
-        distance = len(places) * particle_volume / area
-        is_possible = min(nearest, distance) >= NEAREST_IN_SPACINGS * spacing
-        if is_possible and distance <= FARTHEST_IN_SPACINGS * spacing and min(nearest, distance) > farthest:
-            best, farthest = (places, distance), min(nearest, distance)
-    return best
-
-
-def _rectangle_layers(sides: tuple[float, float], spacing: float) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """Lattices that fit a rectangle, stretched or squeezed, and their smaller spacing."""
-    for counts in product(*((math.floor(side / spacing), math.ceil(side / spacing)) for side in sides)):
-        if min(counts) < 1:
-            continue
-        x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(counts, sides, strict=True))
-        gaps = [side / n for n, side in zip(counts, sides, strict=True) if n > 1]
-        yield np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2), min(gaps, default=math.inf)
-
-
-def _cut_layers(section: Section, area: float, spacing: float) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """Square lattices cut out of a section of an area [m²], around one of their points or between four, and spacings.
-
-    Their cells have exactly that area in all: the jet would be denser or thinner than the fluid otherwise.
-    """
-    fewest, most = (math.ceil(area / (limit * spacing) ** 2) for limit in LATTICE_CONSTANTS)
-    counts = np.unique(np.linspace(max(fewest, 1), max(most, 1), LATTICES_TRIED).round().astype(int))
-    for count, *shift in product(counts, (0.0, 0.5), (0.0, 0.5)):
-        constant = math.sqrt(area / count)
-        reach = np.ceil(section.half_size / constant).astype(int) + 1
-        x, y = ((np.arange(-end, end + 1) + own) * constant for end, own in zip(reach, shift, strict=True))
-        points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-        depth = section.depth(points)
-        order = np.argsort(-depth, kind="stable")
-        last, next_ = depth[order[count - 1]], depth[order[count]]
-        # Those at one depth, such as four around the middle of a disc, belong together.
-        if last >= 0.0 and last - next_ > SAME_IN_SPACINGS * spacing:
-            yield points[np.sort(order[:count])], constant if count > 1 else math.inf
-
-
-def _disc(radius: float) -> Section:
-    return Section(
-        np.full(2, radius), lambda points: radius - np.hypot(points[:, 0], points[:, 1]), math.pi * radius**2
-    )
 
 
 def _half_size(emitter: EmitterParameters, places: NDArray[np.float64], spacing: float) -> tuple[float, float]:
@@ -332,50 +249,3 @@ def _axes_along(direction: Sequence[float]) -> NDArray[np.float64]:
         sideways = np.array([0.0, 1.0, 0.0])
     first = sideways / np.linalg.norm(sideways)
     return np.stack([first, np.cross(along, first), along])
-
-
-def is_same_opening(one: Opening, other: Opening, spacing: float) -> bool:
-    """Whether two emitters have one opening that rests, or rests on one body, as when an inflow changes its speed."""
-    return (
-        _move_alike(one, other)
-        and one.places.shape == other.places.shape
-        and bool(np.allclose(one.points(1), other.points(1), rtol=0.0, atol=SAME_IN_SPACINGS * spacing))
-    )
-
-
-def _move_alike(one: Opening, other: Opening) -> bool:
-    """Whether two openings always are where they are at the start, as seen from each other."""
-    return one.path is None and other.path is None and one.follow == other.follow
-
-
-def opening_collision(one: Opening, other: Opening, name: str, spacing: float) -> str | None:
-    """Why an emitter cannot be in one tank with another one, of this name, or None.
-
-    Layers that leave one must not be where those of the other do at the same time, as they would take their places.
-    """
-    if not _move_alike(one, other) or one.start_s >= other.end_s or other.start_s >= one.end_s:
-        return None
-    if is_same_opening(one, other, spacing):
-        return f"is the same opening as {name}, at the same time; let one start when the other has ended"
-    if float(cKDTree(one.points(1)).query(other.points(1))[0].min()) < NEAREST_IN_SPACINGS * spacing:
-        return f"its opening overlaps that of {name}, at the same time; move one of them"
-    return None
-
-
-def opening_problem(
-    opening: Opening,
-    spacing: float,
-    domain: DomainParameters,
-    solids: Sequence[Solid],
-    earlier: Mapping[str, Opening],
-) -> str | None:
-    """Why an opening cannot be where it is, or None: it is not free, or in the way of an earlier one.
-
-    The earlier ones are named as messages call them. Of one that moves only the start counts, and not if it follows a
-    body that has time to carry it elsewhere before it begins.
-    """
-    is_elsewhere = opening.follow is not None and opening.start_s > 0.0
-    reason = None if is_elsewhere else obstruction(opening, spacing, domain, solids)
-    for name, other in earlier.items():
-        reason = reason or opening_collision(opening, other, name, spacing)
-    return reason

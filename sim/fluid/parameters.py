@@ -53,23 +53,25 @@ class RectangleOpening(Parameters):
     size: tuple[Positive, Positive] = Field(description="Lengths of its sides [m].")
 
 
+OpeningShape = (
+    DiscOpening
+    | RectangleOpening
+    | BoxShape
+    | SphereShape
+    | CylinderShape
+    | CapsuleShape
+    | TorusShape
+    | ConeShape
+    | DuckShape
+    | BunnyShape
+    | MeshShape
+)
+
+
 class EmitterParameters(Parameters):
     """An opening from which fluid flows into the domain, free as soon as it has passed it."""
 
-    shape: Annotated[
-        DiscOpening
-        | RectangleOpening
-        | BoxShape
-        | SphereShape
-        | CylinderShape
-        | CapsuleShape
-        | TorusShape
-        | ConeShape
-        | DuckShape
-        | BunnyShape
-        | MeshShape,
-        Field(discriminator="type"),
-    ] = Field(
+    shape: Annotated[OpeningShape, Field(discriminator="type")] = Field(
         description="The opening: a disc, a rectangle, or what a plane through the centre of another shape cuts out of "
         "it, across its z axis, which points along the flow."
     )

@@ -15,7 +15,8 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path, unknown_name
 from sim.coupling.emitter_bodies import emitter_on
-from sim.fluid.opening import Opening, followed, opening_problem
+from sim.fluid.opening import Opening, followed
+from sim.fluid.opening_conflicts import opening_problem
 from sim.fluid.parameters import shared_conflicts
 from sim.shapes.parameters import BoxShape
 from sim.shapes.sampling import fill_with_particles

@@ -17,7 +17,8 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path
 from sim.core.domain import DomainParameters
-from sim.fluid.opening import Opening, is_same_opening
+from sim.fluid.opening import Opening
+from sim.fluid.opening_conflicts import is_same_opening
 from sim.shapes.solid import Solid
 
 Points = NDArray[np.float64]

@@ -13,7 +13,8 @@ from sim.core.cells import CellGrid, CellSort
 from sim.core.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import domain_wall_samples
 from sim.fluid.emitter import find_free_places
-from sim.fluid.opening import Opening, is_same_opening, obstruction, opening_collision
+from sim.fluid.opening import Opening
+from sim.fluid.opening_conflicts import is_same_opening, obstruction, opening_collision
 from sim.fluid.parameters import EmitterParameters, FluidParameters
 from sim.fluid.particles import Layer, Particles
 from sim.fluid.tank import FluidStart
