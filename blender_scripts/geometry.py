@@ -17,6 +17,8 @@ REST_UV = "rest"
 """UV map of coordinates on the surface at rest [m]: what hangs on it does not swim as the surface moves."""
 PICTURE_UV = "UVMap"  # UV map of coordinates on pictures, by Blender's usual name: the one that image textures follow
 WET = "wet"  # attribute that tells where a fluid touches solids: 1 there, 0 where its surface is free (`wetting`)
+COVERED = "covered"  # attribute of what light goes through: above 1/2 where a liquid covers it (`wetting`)
+COVER_INDEX = "cover_index"  # and that liquid's refractive index, less 1
 
 EMPTY_MESH = SurfaceMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 
@@ -33,6 +35,15 @@ def read_ply(path: Path) -> SurfaceMesh:
     except ValueError as error:
         raise RenderInputError(f"the mesh {path}: {error}") from error
     return mesh
+
+
+def vertex_normals(mesh: SurfaceMesh) -> np.ndarray:
+    """Unit normals of a mesh's vertices by its triangles, weighed by their area, (n, 3)."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float64), 1, 0)
+    areas = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    count = len(mesh.vertices)
+    sums = np.stack([np.bincount(mesh.faces.ravel(), areas[:, axis], minlength=count) for axis in range(3)], axis=1)
+    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
 
 
 def edges_of(mesh: SurfaceMesh) -> tuple[float, float, float] | None:

@@ -12,13 +12,10 @@ from typing import Any
 import bpy
 
 from blender_scripts import smoke_looks, weaves, wood  # noqa: F401 - they register their looks
-from blender_scripts.geometry import WET
-from blender_scripts.optics import per_metre
+from blender_scripts.geometry import COVER_INDEX, COVERED, WET
+from blender_scripts.optics import JUICE_REFLECTANCE, MUD_REFLECTANCE, REFRACTIVE_INDEX, per_metre
 from blender_scripts.shading import LOOKS, Color, LookContext, NodeBuilder, draws, or_default
 
-WATER_IOR = 1.333
-
-HONEY_IOR = 1.49  # of honey with 18 % water (Chataway's table has 1.4915 at 20 °C)
 HONEY_SCATTERING_PER_M = 40.0
 HONEY_ANISOTROPY = 0.8
 """Pollen, wax and fine crystals scatter forwards, chosen by eye: without them a thin stream in a dark room is olive."""
@@ -34,31 +31,49 @@ def new_material(name: str, look: str, context: LookContext) -> Any:
     return material
 
 
-@draws("water")
-def _water(builder: NodeBuilder, context: LookContext) -> None:
-    """Clear water that absorbs red first, and lets light through to what lies under it."""
-    _clear_surface(builder, context, ior=WATER_IOR, tint=(0.94, 0.975, 1.0))
-    builder.volume(_homogeneous_absorption(builder, per_metre("water", context.inner_density, context.color)))
+def _clear(builder: NodeBuilder, context: LookContext, *, look: str, tint: Color) -> None:
+    """A clear liquid that absorbs, and lets light through to what lies under it."""
+    _clear_surface(builder, context, look=look, tint=tint)
+    builder.volume(_homogeneous_absorption(builder, per_metre(look, context.inner_density, context.color)))
+
+
+draws("water")(partial(_clear, look="water", tint=(0.94, 0.975, 1.0)))
+# What a surface reflects alone dims the light that goes straight through: the colour is the inside's.
+draws("wine")(partial(_clear, look="wine", tint=(0.96, 0.96, 0.96)))
+draws("oil")(partial(_clear, look="oil", tint=(0.94, 0.94, 0.94)))
+draws("coffee")(partial(_clear, look="coffee", tint=(0.96, 0.96, 0.96)))
+draws("ink")(partial(_clear, look="ink", tint=(0.96, 0.96, 0.96)))
 
 
 def _clear_surface(
-    builder: NodeBuilder, context: LookContext, *, ior: float, tint: Color, color: Color = (1.0, 1.0, 1.0)
+    builder: NodeBuilder, context: LookContext, *, look: str, tint: Color, color: Color = (1.0, 1.0, 1.0)
 ) -> None:
     """The surface of what is clear, which lets light through to what lies under it in a tint."""
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
         Base_Color=color,
         Roughness=or_default(context.roughness, 0.0),
-        IOR=ior,
+        IOR=_relative_index(builder, context, REFRACTIVE_INDEX[look]),
         Transmission_Weight=1.0,
     )
     builder.surface(_refracting(builder, context, shader, tint=tint))
 
 
+def _relative_index(builder: NodeBuilder, context: LookContext, own: float) -> Any:
+    """Refractive index against what is outside: a liquid where one covers the body, else air."""
+    if not context.is_covered:
+        return own
+    covered, index = (builder.node("ShaderNodeAttribute") for _ in range(2))
+    covered.attribute_name, index.attribute_name = COVERED, COVER_INDEX
+    is_covered = builder.math("GREATER_THAN", covered.outputs[2], 0.5)
+    outside = builder.math("MULTIPLY_ADD", is_covered, index.outputs[2], 1.0)
+    return builder.math("DIVIDE", own, outside)
+
+
 @draws("honey")
 def _honey(builder: NodeBuilder, context: LookContext) -> None:
     """Amber that absorbs blue first, a little cloudy."""
-    _clear_surface(builder, context, ior=HONEY_IOR, tint=(1.0, 0.97, 0.9))
+    _clear_surface(builder, context, look="honey", tint=(1.0, 0.97, 0.9))
     absorption = per_metre("honey", context.inner_density, context.color)
     scattering = builder.node(
         "ShaderNodeVolumeScatter",
@@ -72,27 +87,35 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
     builder.volume(both)
 
 
-@draws("milk")
-def _milk(builder: NodeBuilder, context: LookContext) -> None:
-    """White that light enters and leaves elsewhere, red the farthest, under a wet surface."""
+def _cloudy(builder: NodeBuilder, context: LookContext, *, look: str, reflectance: Color) -> None:
+    """A liquid that light enters and leaves elsewhere, red the farthest, under a wet surface."""
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
-        Base_Color=or_default(context.color, MILK_REFLECTANCE),
+        Base_Color=or_default(context.color, reflectance),
         Roughness=or_default(context.roughness, 0.06),
-        IOR=1.35,
+        IOR=REFRACTIVE_INDEX[look],
         Subsurface_Weight=1.0,
         Subsurface_Scale=1.0,
-        Subsurface_Radius=tuple(1.0 / each for each in per_metre("milk", context.inner_density)),
+        Subsurface_Radius=tuple(1.0 / each for each in per_metre(look, context.inner_density)),
     )
+    if context.wets:
+        # Where it touches glass that glass mirrors what there is to mirror between the two.
+        free = builder.math("SUBTRACT", 1.0, _wetness(builder))
+        builder.link(builder.math("MULTIPLY", 0.5, free), shader.inputs["Specular IOR Level"])
     # Paths that follow the light inside; the node's other method is tuned for skin.
     shader.subsurface_method = "RANDOM_WALK"
     builder.surface(shader)
 
 
+draws("milk")(partial(_cloudy, look="milk", reflectance=MILK_REFLECTANCE))
+draws("juice")(partial(_cloudy, look="juice", reflectance=JUICE_REFLECTANCE))
+draws("muddy_water")(partial(_cloudy, look="muddy_water", reflectance=MUD_REFLECTANCE))
+
+
 @draws("glass")
 def _glass(builder: NodeBuilder, context: LookContext) -> None:
     own, tint = (or_default(context.color, color) for color in ((0.97, 0.99, 0.98), (0.90, 0.93, 0.92)))
-    _clear_surface(builder, context, ior=1.5, tint=tint, color=own)
+    _clear_surface(builder, context, look="glass", tint=tint, color=own)
 
 
 @draws("stone")
@@ -128,7 +151,7 @@ def _spray(builder: NodeBuilder, context: LookContext) -> None:
     """Droplets in the air: too small to refract in a picture, so they are white and let some light straight through."""
     white = _scattering(builder, or_default(context.color, (0.96, 0.98, 1.0)))
     glint = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.25))
-    fresnel = builder.node("ShaderNodeFresnel", IOR=WATER_IOR)
+    fresnel = builder.node("ShaderNodeFresnel", IOR=REFRACTIVE_INDEX["water"])
     droplet = builder.mix_shaders(fresnel.outputs[0], white, glint)
     builder.surface(builder.mix_shaders(0.45, droplet, builder.node("ShaderNodeBsdfTransparent")))
 
@@ -145,7 +168,7 @@ def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
 
     Points are hit on their front only, so what passes goes on straight instead of being refracted twice.
     """
-    fresnel = builder.node("ShaderNodeFresnel", IOR=1.0 / WATER_IOR)
+    fresnel = builder.node("ShaderNodeFresnel", IOR=1.0 / REFRACTIVE_INDEX["water"])
     mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.0))
     through = builder.node("ShaderNodeBsdfTransparent", Color=or_default(context.color, (0.97, 0.985, 1.0)))
     builder.surface(builder.mix_shaders(fresnel.outputs[0], through, mirror))
@@ -210,12 +233,17 @@ def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint
         shader = builder.mix_shaders(for_light, shader, clear)
     if not context.wets:
         return shader
-    wet = builder.node("ShaderNodeAttribute")
-    wet.attribute_name = WET
-    straight = wet.outputs[2]
+    straight = _wetness(builder)
     if context.caustics:
         straight = builder.math("MULTIPLY", straight, builder.math("SUBTRACT", 1.0, for_light))
     return builder.mix_shaders(straight, shader, builder.node("ShaderNodeBsdfTransparent"))
+
+
+def _wetness(builder: NodeBuilder) -> Any:
+    """The output socket of how far a fluid touches solids: 1 where it does, 0 where its surface is free."""
+    wet = builder.node("ShaderNodeAttribute")
+    wet.attribute_name = WET
+    return wet.outputs[2]
 
 
 def _asks_for_light(builder: NodeBuilder) -> Any:

@@ -18,8 +18,8 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -53,6 +53,7 @@ from blender_scripts.compatibility import blender_version, require_supported_ver
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
 from blender_scripts.look_table import LOOK_TABLE
+from blender_scripts.optics import REFRACTIVE_INDEX
 from blender_scripts.ply import SurfaceMesh, write_mesh
 from blender_scripts.shading import LookContext, SmokeBox
 from blender_scripts.smoke_looks import glow_of
@@ -105,6 +106,7 @@ class SceneRenderer:
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         self._fluids: list[tuple[dict[str, Any], Any]] = []
         self._touched: list[tuple[dict[str, Any], wetting.Touchable]] = []
+        self._vessels: list[_Vessel] = []
         # Workbench sees through nothing.
         is_plain = spec.get("engine") == "workbench"
         self._has_wet = not is_plain and any(_wets(description) for description in spec["objects"])
@@ -203,12 +205,12 @@ class SceneRenderer:
             exr.strip_metadata(master_path)
 
     def _is_touched(self, description: dict[str, Any]) -> bool:
-        """Whether fluids wet a body. Glass bends light as if from air, so they keep their surface against it.
+        """Whether fluids wet a body. A sheet that bends light has no side that they cover: they keep their surface."""
+        return self._has_wet and not (description["type"] == "mesh_sequence" and _refracts(description))
 
-        Through the sliver between them light is bent as between the two, at all but flat angles.
-        """
-        look = LOOK_TABLE.get(description["material"]["look"])
-        return self._has_wet and not (look is not None and look.refracts)
+    def _is_covered(self, description: dict[str, Any]) -> bool:
+        """Whether it is told of a body where liquids cover it, as it bends light."""
+        return self._has_wet and description["type"] in ("mesh", "moving_mesh") and _refracts(description)
 
     def _file(self, path: str, frame: int) -> Path:
         return self._folder / path.replace("{frame}", f"{frame:06d}")
@@ -234,18 +236,19 @@ class SceneRenderer:
         return places
 
     def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[SurfaceMesh]) -> None:
-        for _, blender_object, mesh, wetness in self._wetted(frame, places, sheets):
+        filled = []
+        for description, blender_object, mesh, wetness in self._wetted(frame, places, sheets):
             geometry.fill_mesh(blender_object.data, mesh, wetness)
+            filled.append((description, mesh))
+        for vessel in self._vessels:
+            vessel.cover(filled, _placed(vessel.touchable, vessel.description, places))
 
     def _wetted(
         self, frame: int, places: dict[str, poses.Pose], sheets: list[SurfaceMesh]
     ) -> Iterator[tuple[dict[str, Any], Any, SurfaceMesh, np.ndarray]]:
         """Every fluid with its surface, and how far each vertex of that touches something."""
         solids = [wetting.Touchable.of(sheet, is_closed=False) for sheet in sheets]
-        for description, body in self._touched:
-            pose = places.get(description["name"])
-            place = (description["position"], description["orientation"]) if pose is None else pose.after(0.0)
-            solids.append(body.placed(*place))
+        solids += [_placed(body, description, places) for description, body in self._touched]
         surfaces = [_read_surface(self._file(description["file"], frame)) for description, _ in self._fluids]
         for (description, blender_object), surface in zip(self._fluids, surfaces, strict=True):
             # Cycles follows light through one surface on its way to the floor, and not through two that are parallel.
@@ -289,6 +292,7 @@ class SceneRenderer:
             edges=description.get("edges") if at_rest is None else geometry.edges_of(at_rest),
             name=name,
             wets=_wets(description),
+            is_covered=self._is_covered(description),
         )
         if description["material"]["blend"] is None:
             material = looks.new_material(name, look, context)
@@ -299,15 +303,7 @@ class SceneRenderer:
                 self.pictures_by_uv.append(name)
         if at_rest is not None:
             blender_object = geometry.new_mesh_object(name, at_rest)
-            blender_object.rotation_mode = "QUATERNION"
-            if kind == "mesh":
-                blender_object.location = description["position"]
-                blender_object.rotation_quaternion = description["orientation"]
-            else:
-                self._bodies.append((description, blender_object))
-            geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
-            if self._is_touched(description):
-                self._touched.append((description, wetting.Touchable.of(at_rest, is_closed=True)))
+            self._take_body(description, blender_object, at_rest)
         elif kind == "mesh_sequence":
             blender_object = geometry.new_mesh_object(name, geometry.EMPTY_MESH)
             (self._fluids if self._has_wet and _wets(description) else self._sequences).append(
@@ -323,6 +319,56 @@ class SceneRenderer:
                 self._fires[name] = volumes.FireLight(name, glow_of(context))
         blender_object.data.materials.append(material)
         return blender_object
+
+    def _take_body(self, description: dict[str, Any], blender_object: Any, at_rest: SurfaceMesh) -> None:
+        """Put a body where it stands, or note that it moves, and what fluids are to know of it."""
+        blender_object.rotation_mode = "QUATERNION"
+        if description["type"] == "mesh":
+            blender_object.location = description["position"]
+            blender_object.rotation_quaternion = description["orientation"]
+        else:
+            self._bodies.append((description, blender_object))
+        geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
+        if self._is_touched(description):
+            self._touched.append((description, wetting.Touchable.of(at_rest, is_closed=True)))
+        if self._is_covered(description):
+            self._vessels.append(_Vessel(description, blender_object, at_rest, self._touched[-1][1]))
+
+
+@dataclass(frozen=True)
+class _Vessel:
+    """A body that light goes through, and that liquids may cover."""
+
+    description: dict[str, Any]
+    blender_object: Any
+    at_rest: SurfaceMesh
+    touchable: wetting.Touchable
+
+    def cover(self, fluids: Sequence[tuple[dict[str, Any], SurfaceMesh]], placed: wetting.Touchable) -> None:
+        """Tell its mesh where fluids cover it, and of which refractive index they are: of two, the one that is more."""
+        points = placed.to_world(self.at_rest.vertices.astype(np.float64))
+        outwards = geometry.vertex_normals(self.at_rest) @ placed.rotation.T
+        covered, index = np.zeros(len(points)), np.zeros(len(points))
+        for description, surface in fluids:
+            share = wetting.covered(points, outwards, surface=surface, reach=description["wets_within"])
+            own = REFRACTIVE_INDEX.get(description["material"]["look"], REFRACTIVE_INDEX["water"]) - 1.0
+            # Where none is near yet the index is that of the first: it is not mixed with that of air.
+            index = np.where((share > covered) | (index == 0.0), own, index)
+            covered = np.maximum(covered, share)
+        geometry.set_attribute(self.blender_object.data, geometry.COVERED, covered.astype(np.float32))
+        geometry.set_attribute(self.blender_object.data, geometry.COVER_INDEX, index.astype(np.float32))
+
+
+def _placed(body: wetting.Touchable, description: dict[str, Any], places: dict[str, poses.Pose]) -> wetting.Touchable:
+    """A body where it is in a frame."""
+    pose = places.get(description["name"])
+    place = (description["position"], description["orientation"]) if pose is None else pose.after(0.0)
+    return body.placed(*place)
+
+
+def _refracts(description: dict[str, Any]) -> bool:
+    look = LOOK_TABLE.get(description["material"]["look"])
+    return look is not None and look.refracts
 
 
 def _read_surface(path: Path) -> SurfaceMesh:

@@ -48,6 +48,7 @@ class LookContext:
         edges: of the box around a body at rest, in its own axes [m].
         name: of the body, whose texture and shade are its own; empty for the ground.
         wets: whether the mesh tells where it touches solids, as a fluid's does (`wetting`).
+        is_covered: whether the mesh tells where a liquid covers it, as that of a vessel does.
 
     The others are as in `render.parameters.MaterialParameters`.
     """
@@ -59,6 +60,7 @@ class LookContext:
     edges: tuple[float, float, float] | None = None
     name: str = ""
     wets: bool = False
+    is_covered: bool = False
     color: Color | None = None
     roughness: float | None = None
     caustics: bool | None = None

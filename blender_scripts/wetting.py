@@ -4,6 +4,10 @@ A surface made of particles ends a little short of the solid or a little inside 
 them would reflect like a mirror whatever meets it at more than the critical angle (48.6° in water). A liquid that wets
 has no air there, so looks let rays straight through where it touches (`looks`, docs/decisions/0035-wet-surfaces.md).
 Where two clear fluids meet, the surfaces of both do.
+
+A vessel that light goes through is drawn where it is, not where the particles end: the liquid lets rays straight
+through there, and the vessel bends them as between its glass and the liquid that covers it
+(docs/decisions/0057-liquid-in-glass.md).
 """
 
 from __future__ import annotations
@@ -25,6 +29,8 @@ _TOUCHES_WITHIN, _FREE_BEYOND = 2.0 / 3.0, 4.0 / 3.0
 _ALONG, _TOWARDS = 0.1, 0.5
 """Cosines between the outward normal and the way to the solid: free below the first, touching above the second. A free
 surface that ends at a wall, and the outside of a film, do not face the solid although they are near it."""
+
+_COVER_BLUR = 1.0 / 3.0  # half width of the edge of what covers a solid, in `reach`; looks draw its middle as a line
 
 _NO_WAY = 1.0e-3  # a distance too short to have a direction, in `reach`
 
@@ -78,6 +84,10 @@ class Touchable:
         part = SurfaceMesh(surface.vertices[used], triangles.reshape(-1, 3))
         return replace(cls.of(part, is_closed=True), can_be_entered=False)
 
+    def to_world(self, own: np.ndarray) -> np.ndarray:
+        """Places of its own axes [m], (n, 3), in the world."""
+        return own @ self.rotation.T + self.position
+
     def placed(self, position: Sequence[float], orientation: Sequence[float]) -> Touchable:
         """The same with its origin elsewhere [m], and turned by a unit quaternion (w, x, y, z)."""
         rotation = np.array(Quaternion(orientation).to_matrix())
@@ -108,6 +118,48 @@ def wetted(
     if dips:
         mesh = replace(mesh, vertices=(mesh.vertices + touch.moves).astype(np.float32))
     return mesh, touch.wet.astype(np.float32)
+
+
+def covered(points: np.ndarray, outwards: np.ndarray, *, surface: SurfaceMesh, reach: float) -> np.ndarray:
+    """How far a liquid covers places on a solid that light goes through: above 1/2 where it does, (n,) from 0 to 1.
+
+    It does where there is liquid about a particle's radius off the solid, beyond the sliver that its surface leaves.
+
+    Args:
+        points: on the solid [m], (n, 3).
+        outwards: unit normals there, (n, 3).
+        surface: of the liquid.
+        reach: as for `wetted` [m].
+    """
+    probes = SurfaceMesh((points + _TOUCHES_WITHIN * reach * outwards).astype(np.float32), EMPTY_MESH.faces)
+    liquid = Touchable.of_fluid(surface, near=probes, reach=reach)
+    share = np.zeros(len(points))
+    if liquid.tree is None or liquid.outwards is None:
+        return share
+    numbers, places, triangles = _nearest(liquid, probes.vertices.astype(np.float64), _FREE_BEYOND * reach)
+    if len(numbers):
+        off = ((probes.vertices[numbers] - places) * liquid.outwards.at(triangles, places)).sum(axis=1)
+        distance = np.linalg.norm(probes.vertices[numbers] - places, axis=1)
+        blur = _COVER_BLUR * reach
+        share[numbers] = 1.0 - _smoothstep(np.copysign(distance, off), -blur, blur)
+    return share
+
+
+def _nearest(touchable: Touchable, own: np.ndarray, farthest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points in an object's axes (n, 3) [m], those within a distance [m] of it: numbers, nearest places, triangles.
+
+    (m,), (m, 3) [m] and (m,).
+    """
+    candidates = np.flatnonzero(((own > touchable.low - farthest) & (own < touchable.high + farthest)).all(axis=1))
+    near, places, triangles = [], [], []
+    find = touchable.tree.find_nearest
+    for number, point in zip(candidates.tolist(), own[candidates].tolist(), strict=True):
+        place, _, triangle, _ = find(point, farthest)
+        if place is not None:
+            near.append(number)
+            places.append(place[:])
+            triangles.append(triangle)
+    return np.array(near, dtype=np.int64), np.array(places).reshape(-1, 3), np.array(triangles, dtype=np.int64)
 
 
 @dataclass
@@ -142,24 +194,15 @@ def _add(touch: _Touch, touchable: Touchable, mesh: SurfaceMesh) -> None:
     """Take a body, a cloth or a fluid into account, for the vertices that are near it."""
     farthest = _FREE_BEYOND * touch.reach
     own = (mesh.vertices - touchable.position) @ touchable.rotation
-    candidates = np.flatnonzero(((own > touchable.low - farthest) & (own < touchable.high + farthest)).all(axis=1))
-    near, places, triangles = [], [], []
-    find = touchable.tree.find_nearest
-    for number, point in zip(candidates.tolist(), own[candidates].tolist(), strict=True):
-        place, _, triangle, _ = find(point, farthest)
-        if place is not None:
-            near.append(number)
-            places.append(place[:])
-            triangles.append(triangle)
-    if not near:
+    numbers, places, triangles = _nearest(touchable, own, farthest)
+    if not len(numbers):
         return
-    numbers = np.array(near)
-    way = np.array(places) - own[numbers]
+    way = places - own[numbers]
     distance = np.linalg.norm(way, axis=1)
     towards = way / np.maximum(distance, 1e-12)[:, None]
     if touchable.outwards is not None:
         # The way to the nearest point turns around where the surface dips into the solid, which is as good as touching.
-        inwards = -touchable.outwards.at(np.array(triangles), np.array(places))
+        inwards = -touchable.outwards.at(triangles, places)
         is_outside = (towards * inwards).sum(axis=1) > 0.0
         is_outside &= distance > _NO_WAY * touch.reach
         distance = np.where(is_outside, distance, 0.0)

@@ -13,9 +13,11 @@ from typing import Any
 import bpy
 
 from blender_scripts.look_table import LOOK_TABLE
+from blender_scripts.optics import seen_across
 
 _ALPHA_OF_CLEAR_BODIES = 0.45
 _WATER_COLOR = (0.10, 0.36, 0.62)  # of a body that lets light through and has no colour of its own
+_PALE = ("water", "glass", None)
 _FIRE_COLOR = (0.95, 0.35, 0.05)
 
 
@@ -63,7 +65,8 @@ def _viewport_color(material: Any, described: dict[str, Any]) -> tuple[float, fl
     if shader is None:
         return (*(color or (0.8, 0.8, 0.8)), 1.0)
     if shader.inputs["Transmission Weight"].default_value > 0.5:
-        return (*(color or _WATER_COLOR), _ALPHA_OF_CLEAR_BODIES)
+        own = _WATER_COLOR if described.get("look") in _PALE else seen_across(described["look"])
+        return (*(color or own), _ALPHA_OF_CLEAR_BODIES)
     return (*(color or _mean_color(shader.inputs["Base Color"])), 1.0)
 
 

@@ -268,14 +268,14 @@ class MaterialParameters(Parameters):
     roughness: Fraction | None = Field(default=None, description="Roughness [-]; the look's own if omitted.")
     density: Positive | None = Field(
         default=None,
-        description="Smoke and fire: extinction per metre at density 1 [1/m]. Factor on the absorption of "
-        "water, on the absorption and scattering of honey, on the scattering of milk [-]. By the body's size if "
-        "omitted.",
+        description="Smoke and fire: extinction per metre at density 1 [1/m]. Factor on the absorption of water, wine, "
+        "oil, coffee and ink, on the absorption and scattering of honey, on the scattering of milk, juice and muddy "
+        "water [-]. By the body's size if omitted.",
     )
     caustics: bool = Field(
         default=False,
-        description="Water, honey and glass: bend the light of lamps onto what lies around, instead of letting it "
-        "straight through; docs/guide/rendering.md has what it costs.",
+        description="Clear liquids, honey and glass: bend the light of lamps onto what lies around, instead of letting "
+        "it straight through; docs/guide/rendering.md has what it costs.",
     )
     thread_spacing: Positive | None = Field(
         default=None, description="Woven cloth: distance of its threads [m]; the look's own if omitted."

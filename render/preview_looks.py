@@ -29,6 +29,12 @@ _GREY = _even((0.5, 0.5, 0.5), 0.5)
 _PREVIEWS: dict[str, PreviewLook] = {
     "water": _clear((0.62, 0.82, 0.9), 1.33),
     "honey": PreviewLook((0.8, 0.42, 0.05), {"roughness": 0.05, "opacity": 0.75, "ior": 1.49}),
+    "wine": PreviewLook((0.35, 0.01, 0.03), {"roughness": 0.02, "opacity": 0.8, "ior": 1.343}),
+    "oil": PreviewLook((0.8, 0.65, 0.08), {"roughness": 0.02, "opacity": 0.5, "ior": 1.469}),
+    "coffee": _even((0.05, 0.02, 0.008), 0.02),
+    "ink": _even((0.005, 0.01, 0.1), 0.02),
+    "juice": _even((0.9, 0.42, 0.03), 0.06),
+    "muddy_water": _even((0.32, 0.21, 0.12), 0.06),
     "milk": _even((0.94, 0.92, 0.86), 0.06),
     "glass": _clear((0.94, 0.97, 0.95), 1.5),
     "smoke": _even((0.75, 0.75, 0.75), 1.0),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blender_scripts.look_table import LOOK_TABLE
+from blender_scripts.optics import INSIDES
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
@@ -67,9 +68,10 @@ def _coarser(job: Job, factor: float, _solids: SolidBuilder | None) -> list[Chan
 
 
 def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: Materials) -> Iterator[SceneObject]:
-    # Nobody sees from inside where a fluid of another look touches solids; a material of one's own may look at it.
+    # Nobody sees from inside where a fluid of another look touches solids, but through glass; a material of one's own
+    # may look at it.
     material = material_of(BODY)
-    sees = material.look is None or LOOK_TABLE[material.look].refracts
+    sees = material.look is None or LOOK_TABLE[material.look].refracts or (material.look in INSIDES and _in_glass(job))
     yield MeshSequenceObject(
         name=fluid.name,
         file=SURFACE.file_of(fluid.name),
@@ -83,6 +85,13 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
             kind=kind,
             material=material_of(kind),
         )
+
+
+def _in_glass(job: Job) -> bool:
+    """Whether something beside the fluids has a look that light goes through."""
+    fluids = {fluid.name for fluid in job.fluid}
+    looks = (material.look for name, material in job.material.items() if name not in fluids)
+    return any(look is not None and LOOK_TABLE[look].refracts for look in looks)
 
 
 def _reach(_job: Job, _layout: JobLayout, _fluid: FluidParameters, group: h5py.Group) -> Reach | None:

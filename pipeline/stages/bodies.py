@@ -2,6 +2,9 @@
 
 from collections.abc import Mapping
 
+import numpy as np
+
+from blender_scripts.look_table import LOOK_TABLE
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
@@ -19,6 +22,11 @@ from sim.shapes.solid import TriangleMesh
 
 MESH_S = 2.0
 """Time of meshing a body, its worker's start included [s]."""
+EDGE_IN_RADII = 1.5
+"""Longest edge of a body that light goes through, in radii of a fluid's particles: its vertices tell where the fluid
+covers it (`blender_scripts.wetting`)."""
+MOST_TRIANGLES = 500_000
+"""About how many such a body has at most: a larger one has a coarser line where the fluid ends."""
 
 
 class BodiesStage(Stage):
@@ -43,6 +51,7 @@ class BodiesStage(Stage):
                     shape=by_content(body).shape,
                     scale=body.scale,
                     **({"textured": True} if _is_textured(job, body) else {}),
+                    **({"longest_edge": edge} if (edge := _longest_edge(job, body)) is not None else {}),
                 ),
                 subject=body.name,
             )
@@ -59,7 +68,11 @@ class BodiesStage(Stage):
         from sim.shapes.placement import build_solid
 
         parameters = next(body for body in context.job.rigid if body.name == context.task.subject)
-        mesh = build_solid(parameters).rest_mesh()
+        solid = build_solid(parameters)
+        mesh = solid.rest_mesh()
+        if (edge := _longest_edge(context.job, parameters)) is not None:
+            area = float(np.linalg.norm(mesh.area_vectors, axis=1).sum())
+            mesh = solid.rest_mesh(max(edge, (area / MOST_TRIANGLES) ** 0.5))
         shape, uv = parameters.shape, None
         if isinstance(shape, MeshShape) and _is_textured(context.job, parameters):
             at_own_size = TriangleMesh(mesh.vertices / parameters.scale, mesh.faces)
@@ -69,6 +82,14 @@ class BodiesStage(Stage):
             with context.committing(output, validate_ply) as path:
                 write_ply(path, piece.vertices, piece.faces, corner_uv=uv)
         context.progress(1, 1)
+
+
+def _longest_edge(job: Job, body: RigidBodyParameters) -> float | None:
+    """Longest edge that its mesh may have [m], if it is one that fluids are seen through."""
+    look = material_of(job, body.name).look
+    if look is None or not LOOK_TABLE[look].refracts or not job.fluid:
+        return None
+    return EDGE_IN_RADII * min(fluid.particle_radius for fluid in job.fluid)
 
 
 def _is_textured(job: Job, body: RigidBodyParameters) -> bool:

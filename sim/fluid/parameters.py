@@ -26,6 +26,7 @@ from sim.shapes.parameters import (
     DuckShape,
     MeshShape,
     Placement,
+    RevolvedShape,
     SphereShape,
     TorusShape,
 )
@@ -62,6 +63,7 @@ OpeningShape = (
     | CapsuleShape
     | TorusShape
     | ConeShape
+    | RevolvedShape
     | DuckShape
     | BunnyShape
     | MeshShape

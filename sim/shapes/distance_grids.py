@@ -1,4 +1,4 @@
-"""Grids of a mesh's distances, as cloth and smoke read them on the device, as fine as its walls need."""
+"""Grids of a body's distances, as cloth and smoke read them on the device, as fine as its walls need."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mesh_solid import MeshSolid
 from sim.shapes.placement import PlacedSolid
+from sim.shapes.revolved import Revolved
 from sim.shapes.sampling import stratified_points
+from sim.shapes.solid import RestShape
 
 CELLS = 96  # along the longest edge of a mesh: 1 cm of a body of 1 m, as coarse as cloth. More where walls are thin.
 CELLS_PER_WALL = 2.0  # one cell has one layer of nodes inside, whose distances may be next to nothing
@@ -31,8 +33,9 @@ def sampled_distances(solid: PlacedSolid) -> LevelSet:
 
 
 def thin_wall(solid: PlacedSolid) -> float:
-    """Thickness [m] that all of a mesh has but for `THIN_SHARE` of its surface; infinite for primitives."""
-    if not isinstance(solid.shape, MeshSolid):
+    """Thickness [m] that all of a body has but for `THIN_SHARE` of its surface; infinite for what is known by a formula
+    on the device."""
+    if not isinstance(solid.shape, MeshSolid | Revolved):
         return np.inf
     return solid.scale * wall_thickness(solid.shape, THIN_SHARE)
 
@@ -57,16 +60,17 @@ def _node_count(extent: NDArray[np.float64], spacing: float) -> float:
     return float(np.prod(np.ceil(extent / spacing + 2.0 * GRID_PADDING) + 1.0))
 
 
-def local_thickness(solid: MeshSolid) -> NDArray[np.float64]:
+def local_thickness(solid: RestShape) -> NDArray[np.float64]:
     """Diameters [m] of the largest balls in a solid that touch points of its surface, evenly spread by area, (p,).
 
     Between parallel walls that is their distance; beside a sharp edge it is small.
     """
-    points, face = stratified_points(solid.mesh, PROBES)
-    inwards = -solid.mesh.area_vectors[face]
+    mesh = solid.surface_mesh(None)
+    points, face = stratified_points(mesh, PROBES)
+    inwards = -mesh.area_vectors[face]
     inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
     low = np.zeros(len(points))
-    high = np.full(len(points), 0.5 * float(np.ptp(solid.bounds, axis=0).max()))
+    high = np.full(len(points), 0.5 * float(np.ptp(mesh.bounds, axis=0).max()))
     for _ in range(HALVINGS):
         radius = 0.5 * (low + high)
         fits = -solid.signed_distance(points + radius[:, None] * inwards) > TOUCHING * radius
@@ -75,6 +79,6 @@ def local_thickness(solid: MeshSolid) -> NDArray[np.float64]:
     return (1.0 + TOUCHING) * low
 
 
-def wall_thickness(solid: MeshSolid, share: float) -> float:
-    """Thickness [m] that all but a share [-] of a mesh's surface has at least."""
+def wall_thickness(solid: RestShape, share: float) -> float:
+    """Thickness [m] that all but a share [-] of a shape's surface has at least."""
     return float(np.quantile(local_thickness(solid), share))

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from sim.core.parameters import Parameters, Positive, Vector3
+from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
 
 PositiveVector3 = tuple[Positive, Positive, Positive]
 
@@ -57,6 +57,19 @@ class ConeShape(Parameters):
     height: Positive = Field(description="Height along z [m].")
 
 
+class RevolvedShape(Parameters):
+    """A profile turned around z: a glass, a bowl, a vase, a ring; its bounding box centred on the origin.
+
+    The points go once around the wall. Both ends on the axis (radius 0) make a body that reaches the axis; both off it
+    make a ring, closed from the last point to the first.
+    """
+
+    type: Literal["revolved"]
+    profile: Annotated[tuple[tuple[NonNegative, float], ...], Field(min_length=3, max_length=400)] = Field(
+        description="Corners of the outline, radius and height each [m], in either direction."
+    )
+
+
 class DuckShape(Parameters):
     """The procedural rubber duck: swims along +x, its bounding box centred on the origin."""
 
@@ -89,7 +102,16 @@ class MeshShape(Parameters):
 
 
 Shape = Annotated[
-    BoxShape | SphereShape | CylinderShape | CapsuleShape | TorusShape | ConeShape | DuckShape | BunnyShape | MeshShape,
+    BoxShape
+    | SphereShape
+    | CylinderShape
+    | CapsuleShape
+    | TorusShape
+    | ConeShape
+    | RevolvedShape
+    | DuckShape
+    | BunnyShape
+    | MeshShape,
     Field(discriminator="type"),
 ]
 

@@ -112,6 +112,7 @@ _BUILDERS: Mapping[str, Callable[..., RestShape]] = {
     "capsule": lambda shape: Capsule(shape.radius, shape.height),
     "torus": _build_torus,
     "cone": lambda shape: Cone(shape.radius, shape.height),
+    "revolved": lambda shape: _module("revolved").build_revolved(shape),
     "duck": lambda shape: _module("procedural").build_duck(shape.length),
     "bunny": lambda shape: _module("procedural").build_bunny(shape.height),
     "mesh": lambda shape: _module("mesh_file").load_mesh_solid(shape),

@@ -18,14 +18,15 @@ Distances = NDArray[np.float64]
 SMOOTH_SEGMENTS = 160  # of a full circle when only looks count: a chord is off by 0.02 % of the radius
 
 
-def _segments(radius: float, max_edge: float | None) -> int:
+def segments_of(radius: float, max_edge: float | None) -> int:
     """Segments of a circle so that edges, diagonals of the quads included, stay within `max_edge` [m]."""
     if max_edge is None:
         return SMOOTH_SEGMENTS
     return max(SMOOTH_SEGMENTS, int(np.ceil(2.0 * np.pi * radius / (max_edge / np.sqrt(2.0)))))
 
 
-def _axial_edge(max_edge: float | None) -> float:
+def axial_edge(max_edge: float | None) -> float:
+    """Longest edge of a profile that is turned [m], so that diagonals of the quads stay within `max_edge`."""
     return np.inf if max_edge is None else max_edge / np.sqrt(2.0)
 
 
@@ -60,7 +61,7 @@ class Box(RestShape):
 
     def surface_mesh(self, max_edge: float | None) -> TriangleMesh:
         """Faces cut into rectangles; two triangles each."""
-        return grid_box(self.size, _axial_edge(max_edge))
+        return grid_box(self.size, axial_edge(max_edge))
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ class Cylinder(RestShape):
         """A revolved rectangle."""
         half = 0.5 * self.height
         profile = [(0.0, -half), (self.radius, -half), (self.radius, half), (0.0, half)]
-        return revolve(subdivide_polyline(profile, _axial_edge(max_edge)), _segments(self.radius, max_edge))
+        return revolve(subdivide_polyline(profile, axial_edge(max_edge)), segments_of(self.radius, max_edge))
 
 
 @dataclass(frozen=True)
@@ -139,12 +140,12 @@ class Capsule(RestShape):
 
     def surface_mesh(self, max_edge: float | None) -> TriangleMesh:
         """A revolved half stadium."""
-        segments = _segments(self.radius, max_edge)
+        segments = segments_of(self.radius, max_edge)
         angle = np.linspace(0.0, 0.5 * np.pi, segments // 4 + 1)
         r, z = self.radius * np.sin(angle), -self.radius * np.cos(angle) - 0.5 * self.height
         r[0] = 0.0
         profile = [*zip(r, z, strict=True), *zip(r[::-1], -z[::-1], strict=True)]
-        return revolve(subdivide_polyline(profile, _axial_edge(max_edge)), segments)
+        return revolve(subdivide_polyline(profile, axial_edge(max_edge)), segments)
 
 
 @dataclass(frozen=True)
@@ -169,10 +170,10 @@ class Torus(RestShape):
 
     def surface_mesh(self, max_edge: float | None) -> TriangleMesh:
         """A revolved circle."""
-        around_tube = _segments(self.minor_radius, max_edge) // (2 if max_edge is None else 1)
+        around_tube = segments_of(self.minor_radius, max_edge) // (2 if max_edge is None else 1)
         angle = np.linspace(0.0, 2.0 * np.pi, around_tube, endpoint=False)
         r, z = self.major_radius + self.minor_radius * np.cos(angle), self.minor_radius * np.sin(angle)
-        return revolve_ring(np.stack([r, z], axis=1), _segments(self.major_radius + self.minor_radius, max_edge))
+        return revolve_ring(np.stack([r, z], axis=1), segments_of(self.major_radius + self.minor_radius, max_edge))
 
 
 @dataclass(frozen=True)
@@ -207,6 +208,6 @@ class Cone(RestShape):
         """A revolved triangle."""
         half = 0.5 * self.height
         # A few rows keep the smooth normals of the tip from spreading over the whole cone.
-        slant_edge = min(_axial_edge(max_edge), np.hypot(self.radius, self.height) / 32.0)
+        slant_edge = min(axial_edge(max_edge), np.hypot(self.radius, self.height) / 32.0)
         profile = [(0.0, -half), *subdivide_polyline([(self.radius, -half), (0.0, half)], slant_edge)]
-        return revolve(subdivide_polyline(profile, _axial_edge(max_edge)), _segments(self.radius, max_edge))
+        return revolve(subdivide_polyline(profile, axial_edge(max_edge)), segments_of(self.radius, max_edge))

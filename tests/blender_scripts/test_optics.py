@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from blender_scripts.look_table import LOOK_TABLE
-from blender_scripts.optics import HONEY_TINT, INSIDES, per_metre, usual_density
+from blender_scripts.optics import HONEY_TINT, INSIDES, REFRACTIVE_INDEX, per_metre, usual_density
 
-LIQUIDS = ("water", "honey")
+LIQUIDS = ("water", "honey", "wine", "oil", "coffee", "ink")
 
 
 def transmitted(look: str, size: float, density: float, color=None) -> np.ndarray:
@@ -34,6 +34,24 @@ def test_bodies_of_all_sizes_are_as_deep_as_each_other(look):
     depths = [size * np.array(per_metre(look, usual_density(look, size))) for size in (0.01, 0.3, 25.0)]
     np.testing.assert_allclose(depths, np.broadcast_to(depths[0], (3, 3)), rtol=1e-4)
     assert max(depths[0]) > 0.5  # it is seen
+
+
+def test_a_glass_of_wine_is_red_where_it_is_deep_and_pink_at_its_rim():
+    deep, rim = (np.exp(-path * np.array(per_metre("wine", 1.0))) for path in (0.05, 0.003))
+    assert deep[0] > 0.2 and deep[1:].max() < 1e-5
+    assert rim[0] > 0.9 and 0.3 < rim[1] < rim[2] < 0.45
+
+
+def test_coffee_is_black_in_the_cup_and_brown_at_its_rim():
+    deep, rim = (np.exp(-path * np.array(per_metre("coffee", 1.0))) for path in (0.05, 0.005))
+    assert deep.max() < 1e-3
+    assert rim[0] > 2.0 * rim[1] > 4.0 * rim[2]
+
+
+def test_every_look_with_a_smooth_clear_surface_has_a_refractive_index():
+    clear = {name for name, row in LOOK_TABLE.items() if row.refracts}
+    liquids = {name for name in INSIDES if name in LOOK_TABLE and "fluid" in LOOK_TABLE[name].bodies}
+    assert set(REFRACTIVE_INDEX) == clear | liquids
 
 
 def test_densities_mean_what_they_meant():

@@ -11,7 +11,7 @@ SETUP = """
     import bpy
     import numpy as np
     from blender_scripts.ply import SurfaceMesh
-    from blender_scripts.wetting import Touchable, wetted
+    from blender_scripts.wetting import Touchable, covered, wetted
 
     REACH = 0.03
 
@@ -156,4 +156,26 @@ def test_pseudonormals_of_a_cube_weigh_its_triangles_by_their_angles():
         expected = face if is_diagonal else half * (np.abs(half) > 0.05) / np.linalg.norm(half)
         np.testing.assert_allclose(found[1], expected, atol=1e-6)
         np.testing.assert_allclose(found[2:], corners / np.linalg.norm(corners, axis=1)[:, None], atol=1e-6)
+    """)
+
+
+def test_a_liquid_covers_a_wall_up_to_its_level_and_across_the_sliver_beside_it():
+    check("""
+    # The box as liquid, 0.2 m wide, whose side ends 1 cm short of a wall; a particle's radius is 2 cm.
+    heights = np.array([-0.05, 0.0, 0.05, 0.09, 0.099, 0.101, 0.11, 0.15])
+    wall = np.stack([np.full(8, 0.11), np.zeros(8), heights], axis=1)
+    inwards = np.tile((-1.0, 0.0, 0.0), (8, 1))
+    share = covered(wall, inwards, surface=box, reach=REACH)
+    assert ((share > 0.5) == (heights < 0.1)).all()
+    np.testing.assert_allclose(share[[0, 1, 2, 7]], [1, 1, 1, 0], atol=1e-5)
+    # Its outer side, and a wall that the liquid is two radii away from.
+    assert not covered(wall, -inwards, surface=box, reach=REACH).any()
+    assert (covered(wall + (0.03, 0, 0), inwards, surface=box, reach=REACH) < 0.5).all()
+    """)
+
+
+def test_what_is_in_the_middle_of_no_liquid_is_not_covered():
+    check("""
+    empty = SurfaceMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    assert covered(np.zeros((2, 3)), np.ones((2, 3)), surface=empty, reach=REACH).tolist() == [0.0, 0.0]
     """)

@@ -77,6 +77,42 @@ def test_milk_is_the_brightest_and_none_is_black_or_burnt_out(liquids):
     assert all(25 < luminance < 245 for luminance in luminances.values())
 
 
+@pytest.fixture(scope="module")
+def drinks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    """Mean colour of the middle of a ball of each, of the size of a glass."""
+    folder = tmp_path_factory.mktemp("drinks")
+    write_mesh(folder / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.13))
+    places = dict(
+        zip(("wine", "oil", "coffee", "ink", "juice", "muddy_water"), np.linspace(-0.72, 0.72, 6), strict=True)
+    )
+    picture = draw(
+        folder,
+        *(
+            MeshObject(name=look, file="ball.ply", position=(x, 0.0, 0.5), material=liquid(look, 0.21))
+            for look, x in places.items()
+        ),
+        resolution=(128, 72),
+        samples=8,
+    )
+    return {look: patch(picture, x, 0.5, 0.08).mean(axis=(0, 1)) for look, x in places.items()}
+
+
+def test_liquids_have_their_colours(drinks):
+    red, green, blue = drinks["wine"]
+    # The lower half of the ball shows the dark upper half of the room, and the reflection of lamps is white.
+    assert red > 1.5 * max(green, blue)
+    red, green, blue = drinks["oil"]
+    assert min(red, green) > 1.5 * blue and red < 1.3 * green
+    assert drinks["coffee"] @ LUMINANCE < 0.2 * (drinks["oil"] @ LUMINANCE)
+    red, green, blue = drinks["ink"]
+    assert blue > 1.3 * max(red, green)
+    red, green, blue = drinks["juice"]
+    assert red > 1.2 * green > 1.5 * blue
+    red, green, blue = drinks["muddy_water"]
+    assert red > green > blue
+    assert drinks["muddy_water"] @ LUMINANCE < drinks["juice"] @ LUMINANCE
+
+
 @pytest.mark.parametrize("look", ["honey", "milk"])
 def test_density_decides_how_far_light_gets_inside(look, tmp_path):
     write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.5), 0.3))

@@ -18,12 +18,14 @@ from sim.coupling.emitter_bodies import emitter_on
 from sim.fluid.opening import Opening, followed
 from sim.fluid.opening_conflicts import opening_problem
 from sim.fluid.parameters import shared_conflicts
-from sim.shapes.parameters import BoxShape
+from sim.shapes.parameters import BoxShape, MeshShape, RevolvedShape
 from sim.shapes.sampling import fill_with_particles
 
 THINNEST_PLATE_IN_SPACINGS = 1.9
 """Twice the depth of a body's samples (`sim.fluid.boundary_akinci2012`). Fluid rests 0.4 spacings off a thicker plate,
 as off any wall, 0.9 off one of half that, 1.3 off the thinnest."""
+SHARE_OF_WALLS = 0.5
+"""Share of its surface that a vessel has on its walls, at least: beside sharp edges every body is thin."""
 FEWEST_FRAMES_ACROSS = 10
 """A jet by its flow rate that crosses the domain in fewer frames comes out of too narrow an opening, most likely."""
 # Points of a block that are looked at for an overlap with another fluid's.
@@ -127,14 +129,21 @@ def _check_speeds(job: Job, index: int, findings: Findings) -> None:
 
 
 def _check_thin_bodies(job: Job, solids: Solids, findings: Findings) -> None:
-    """Warn of plates thinner than two layers of samples are deep: fluid stands off them."""
+    """Warn of plates and vessels with walls thinner than two layers of samples are deep: fluid stands off them."""
+    from sim.shapes.distance_grids import wall_thickness
+
     spacing = max(fluid.spacing for fluid in job.fluid)
     domain, least = domain_box(job.domain), THINNEST_PLATE_IN_SPACINGS * spacing
     for index, body in enumerate(job.rigid):
         solid, shape = solids.get(("rigid", index)), body.shape
-        if solid is None or not isinstance(shape, BoxShape) or overlap(solid.bounds, domain) == 0.0:
+        if solid is None or overlap(solid.bounds, domain) == 0.0:
             continue
-        thickness = body.scale * min(shape.size)
+        if isinstance(shape, BoxShape):
+            thickness = body.scale * min(shape.size)
+        elif isinstance(shape, RevolvedShape | MeshShape):
+            thickness = body.scale * wall_thickness(solid.shape, SHARE_OF_WALLS)
+        else:
+            continue
         if thickness < least:
             radius = rounded_down(0.5 * thickness / THINNEST_PLATE_IN_SPACINGS)
             findings.warn(

@@ -70,3 +70,30 @@ def test_texture_coordinates_that_are_not_there_change_no_mesh(layout):
         assert isinstance(run_task(planned(layout, box=box)["box"], layout), Finished)
         contents.append(layout.path(layout.body_mesh("box", "body")).read_bytes())
     assert contents[0] == contents[1]
+
+
+FLUID = """
+[[fluid]]
+name = "water"
+particle_radius = 0.004
+[[fluid.block]]
+shape = { type = "box", size = [0.1, 0.1, 0.1] }
+position = [0.0, 0.0, 0.5]
+"""
+
+
+def test_a_body_that_fluid_is_seen_through_is_as_fine_as_the_particles(layout):
+    glass = 'look = "glass"'
+    alone, metal = planned(layout, box=glass), planned(layout, box=LOOK)
+    assert alone["box"].parameters.digest == metal["box"].parameters.digest
+    longest = {}
+    for look in (LOOK, glass):
+        layout.job_file.write_text(JOB.format(box=look, ball=LOOK) + FLUID)
+        tasks = {str(task.subject): task for task in BodiesStage().plan(load_job(layout.job_file), layout)}
+        assert isinstance(run_task(tasks["box"], layout), Finished)
+        mesh = read_ply(layout.path(layout.body_mesh("box", "body")))
+        corners = mesh.vertices[mesh.faces]
+        longest[look] = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+        assert np.ptp(mesh.vertices, axis=0) == pytest.approx([0.1] * 3)
+    assert longest[LOOK] > 0.1
+    assert longest[glass] <= 1.5 * 0.004

@@ -170,6 +170,12 @@ def test_a_clear_fluid_tells_where_it_touches_solids_and_nothing_else_does():
         assert drawn["flag"].wets_within is None
 
 
+def test_milk_in_a_glass_tells_where_it_touches_it():
+    tank = job(material={"water": {"look": "milk"}, "ball": {"look": "glass"}})
+    drawn = {each.name: each for each in render_spec(tank, LAYOUT).objects}
+    assert drawn["water"].wets_within == 1.5 * tank.fluid[0].particle_radius
+
+
 @pytest.mark.parametrize("look", ["honey", "metal"])
 def test_a_look_counts_with_its_revision(look, monkeypatch):
     tank = job(material={"ball": {"look": look}})

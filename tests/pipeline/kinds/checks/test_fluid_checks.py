@@ -95,6 +95,17 @@ def test_a_plate_thinner_than_the_particles_can_hold_is_warned_of(thickness, is_
     assert [says(warning, expected) for warning in warnings] == ([True] if is_warned_of else [])
 
 
+@pytest.mark.parametrize(("wall", "is_warned_of"), [(0.05, True), (0.1, False)])
+def test_a_vessel_whose_wall_is_thinner_than_the_particles_can_hold_is_warned_of(wall, is_warned_of, tmp_path):
+    inner = 0.3 - wall
+    cup = f"[[0, 0], [0.3, 0], [0.3, 0.5], [{inner}, 0.5], [{inner}, {wall}], [0, {wall}]]"
+    vessel = f'[[rigid]]\nname = "cup"\nshape = {{ type = "revolved", profile = {cup} }}\nposition = [0, 0, 0.6]\n'
+    errors, warnings, _ = checked(HEAD + WATER + vessel, tmp_path / "tank.toml")
+    assert errors == []
+    expected = "tank.toml:12 rigid[0].shape: is 0.05 m thin ... 0.076 m ... particle_radius 0.013 m"
+    assert [says(warning, expected) for warning in warnings] == ([True] if is_warned_of else [])
+
+
 def test_the_mass_of_a_block_is_told_beside_that_of_its_volume(tmp_path):
     cube = WATER.replace("[1.0, 1.0, 0.2]", "[0.3, 0.3, 0.3]").replace("0.1]", "0.5]")
     _, _, findings = checked(HEAD + cube, tmp_path / "tank.toml")
