@@ -15,7 +15,7 @@ NOTHING: tuple[str, ...] = ()
 
 MATERIAL_KEYS = (
     *("thread_spacing", "caustics", "roughness", "density", "anisotropy", "edge_fade"),
-    *("emission", "flame_temperature"),
+    *("emission", "flame_temperature", "dye_color"),
 )
 """Keys of a material that have an effect on some looks, in the order that warnings of them have."""
 
@@ -63,9 +63,9 @@ LOOK_TABLE: dict[str, LookRow] = {
     "oil": LookRow(SURFACES, ("roughness", "density", "caustics")),
     "coffee": LookRow(SURFACES, ("roughness", "density", "caustics")),
     "ink": LookRow(SURFACES, ("roughness", "density", "caustics")),
-    "milk": LookRow(SURFACES, ("roughness", "density")),
-    "juice": LookRow(SURFACES, ("roughness", "density")),
-    "muddy_water": LookRow(SURFACES, ("roughness", "density")),
+    "milk": LookRow(SURFACES, ("roughness", "density", "dye_color")),
+    "juice": LookRow(SURFACES, ("roughness", "density", "dye_color")),
+    "muddy_water": LookRow(SURFACES, ("roughness", "density", "dye_color")),
     "smoke": LookRow(VOLUMES, VOLUME_KEYS),
     "fire": LookRow(VOLUMES, (*VOLUME_KEYS, *FLAME_KEYS)),
     "rubber": LookRow(SURFACES, ("roughness",), paints_parts=True, paves=True),

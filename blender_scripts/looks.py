@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 
 from blender_scripts import smoke_looks, weaves, wood  # noqa: F401 - they register their looks
-from blender_scripts.geometry import COVER_INDEX, COVERED, WET
+from blender_scripts.geometry import COVER_INDEX, COVERED, DYE, WET
 from blender_scripts.optics import JUICE_REFLECTANCE, MUD_REFLECTANCE, REFRACTIVE_INDEX, per_metre
 from blender_scripts.shading import LOOKS, Color, LookContext, NodeBuilder, draws, or_default
 
@@ -88,10 +88,15 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
 
 
 def _cloudy(builder: NodeBuilder, context: LookContext, *, look: str, reflectance: Color) -> None:
-    """A liquid that light enters and leaves elsewhere, red the farthest, under a wet surface."""
+    """A liquid that light enters and leaves elsewhere, red the farthest, under a wet surface; dye tints it."""
+    color = or_default(context.color, reflectance)
+    if context.dye_color is not None:
+        dye = builder.node("ShaderNodeAttribute")
+        dye.attribute_name = DYE
+        color = builder.mix_colors(dye.outputs[2], color, context.dye_color)
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
-        Base_Color=or_default(context.color, reflectance),
+        Base_Color=color,
         Roughness=or_default(context.roughness, 0.06),
         IOR=REFRACTIVE_INDEX[look],
         Subsurface_Weight=1.0,

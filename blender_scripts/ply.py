@@ -26,6 +26,7 @@ GROUPS = {
     "velocities": ("vx", "vy", "vz"),
     "uv": ("s", "t"),
     "wet": ("wet",),
+    "dye": ("dye",),
 }
 """Columns of vertices by the names of their arrays, in the order that files have them."""
 _LONGEST_HEADER = 4096
@@ -61,6 +62,7 @@ class SurfaceMesh:
         velocities: (n, 3) float32 [m/s], or None.
         uv: (n, 2) float32 coordinates on the surface at rest [m], or None.
         wet: (n, 1) float32, how far a fluid's vertices touch solids: 1 where they do, 0 where they are free; or None.
+        dye: (n, 1) float32 concentration of a fluid's dye [-], or None.
         corner_uv: (m, 3, 2) float32 coordinates on pictures, of the corners of faces, or None.
     """
 
@@ -70,6 +72,7 @@ class SurfaceMesh:
     velocities: NDArray[np.float32] | None = None
     uv: NDArray[np.float32] | None = None
     wet: NDArray[np.float32] | None = None
+    dye: NDArray[np.float32] | None = None
     corner_uv: NDArray[np.float32] | None = None
 
 

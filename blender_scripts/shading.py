@@ -70,6 +70,7 @@ class LookContext:
     edge_fade: float | None = None
     emission: float | None = None
     flame_temperature: float | None = None
+    dye_color: Color | None = None
 
     @property
     def inner_density(self) -> float:
@@ -96,8 +97,9 @@ class LookContext:
     def of(cls, material: dict[str, Any], **scene: Any) -> LookContext:
         """The context for a material of the specification; `scene` are the fields that it does not decide."""
         own = {name: material.get(name) for name in ("color", *MATERIAL_KEYS)}
-        if own["color"] is not None:
-            own["color"] = tuple(own["color"])
+        for name in ("color", "dye_color"):
+            if own[name] is not None:
+                own[name] = tuple(own[name])
         return cls(**scene, **own)
 
 

@@ -300,6 +300,12 @@ class MaterialParameters(Parameters):
         "glows more or less as a black body does.",
     )
 
+    dye_color: Color | None = Field(
+        default=None,
+        description="Milk, juice and muddy water: colour of a fluid whose dye has the concentration 1, linear RGB; it "
+        "mixes evenly with color, that of the concentration 0.",
+    )
+
     @field_validator("blend")
     @classmethod
     def _names_a_material(cls, blend: str | None) -> str | None:

@@ -133,6 +133,7 @@ def _build_fluids(
         positions=filling.positions,
         velocities=filling.velocities,
         phase=filling.phase,
+        dye=filling.dye,
         boundary=BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples),
         moving=BoundarySamples.of_bodies() if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
         sheets=None if cloth is None else cloth.sheets,

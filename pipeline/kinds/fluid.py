@@ -22,6 +22,7 @@ from pipeline.model.looks import BODY, WHITEWATER
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_particles
+from render.dye import dye_at
 from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
@@ -130,7 +131,10 @@ def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
         parameters=job.surface,
         threads=threads,
     )
-    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities)
+    dye, radius = fluid.arrays.get("dye"), fluid.number("particle_radius")
+    if dye is not None:
+        dye = dye_at(surface.vertices, fluid.arrays["position"], dye, particle_radius=radius)
+    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities, dye=dye)
 
 
 def _facts(fluid: FluidParameters, count: float | None) -> str:

@@ -21,6 +21,7 @@ from sim.core.parameters import Vector3
 from sim.core.scan import exclusive_scan, scan_scratch_length
 from sim.fluid.boundary import BodyStates, at_origin
 from sim.fluid.boundary_akinci2012 import BoundarySamples
+from sim.fluid.dye import DYE
 from sim.fluid.kernels import Discretization, wall_layers
 from sim.fluid.opening import openings_of
 from sim.fluid.opening_conflicts import is_same_opening
@@ -113,6 +114,7 @@ class Emission:
         self._discretization, self._spacing = discretization, discretization.spacing
         openings = openings_of(fluids, discretization.particle_volume, bodies)
         self._phase, self.openings = [number for number, _ in openings], [opening for _, opening in openings]
+        self._dyes = [emitter.dye for fluid in fluids for emitter in fluid.emitter]
         self._carriers = [None if each.follow is None else carriers[each.follow] for each in self.openings]
         self._layers = np.zeros(len(self.openings), dtype=np.int64)
         self._states, self._states_s = at_origin(0), 0.0
@@ -339,7 +341,7 @@ class Emission:
             candidates, particles.arrays, particles.cells.cell_start, self._grid.on_device, sorted_count, clearance
         )
         added = exclusive_scan(self._free, len(points), self._scratch, self._order)
-        particles.append(candidates, added)
+        particles.append(candidates, added, {DYE: self._dyes[number]})
         self.emitted += added
         self.blocked += len(points) - added
 

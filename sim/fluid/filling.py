@@ -33,6 +33,7 @@ class FluidFilling:
     positions: NDArray[np.float32]  # (n, 3) float32 [m]
     velocities: NDArray[np.float32]  # (n, 3) float32 [m/s]
     phase: NDArray[np.int32]  # which of the fluids each particle is of, (n,) int32
+    dye: NDArray[np.float32]  # concentration of dye [-], (n,) float32
 
 
 def fill_fluids(
@@ -51,7 +52,7 @@ def fill_fluids(
         ValueError: a block is left without a particle.
     """
     positions, velocities = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
-    phase = [np.empty(0, np.int32)]
+    phase, dye = [np.empty(0, np.int32)], [np.empty(0, np.float32)]
     filled: list[Solid] = []
     for index, fluid in enumerate(fluids):
         spacing = fluid.spacing
@@ -70,7 +71,8 @@ def fill_fluids(
             positions.append(points)
             velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
             phase.append(np.full(len(points), index, dtype=np.int32))
-    return FluidFilling(np.concatenate(positions), np.concatenate(velocities), np.concatenate(phase))
+            dye.append(np.full(len(points), block.dye, dtype=np.float32))
+    return FluidFilling(*map(np.concatenate, (positions, velocities, phase, dye)))
 
 
 def surroundings(domain: DomainParameters, walls: Sequence[Solid], filled: Sequence[Solid]) -> Surroundings:

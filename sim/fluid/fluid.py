@@ -12,6 +12,7 @@ import taichi as ti
 from sim.core.host_access import add, viewed
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Remedies
+from sim.fluid.dye import DYE, Dye
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
 from sim.fluid.kernels import Discretization
@@ -54,6 +55,7 @@ class SPHFluid(ABC):
         expected_speed: largest speed to expect [m/s].
         signal_speed: speed of the signals that limit the time step [m/s].
         tank: the particles, and what is around them: `particles`, `boundary` and `body_forces`.
+        dye: its diffusion; None where no fluid has some.
         cohesion: surface tension, and what it asks of speeds and steps.
         forces: all but those of pressure.
         solves: the iterative solves of this frame, by what they are for.
@@ -80,18 +82,20 @@ class SPHFluid(ABC):
         self.expected_speed = _expected_speed(start, self.cohesion.stress)
         self.signal_speed = self.parameters.sound_speed or self.speed_ratio * self.expected_speed
         self._stiffest = float(self.phases.viscosities.max()) * max(1.0, self.parameters.wall_friction)
+        self._with_dye = any(fluid.has_dye for fluid in start.fluids)
         with_implicit = is_implicit(self.parameters, self._stiffest, self.signal_speed)
         self.tank = ParticleTank(
             start,
             self.phases,
             self.discretization,
             skin=self.parameters.skin,
-            carried=(*self.carried, *(CARRIED if with_implicit else ())),
+            carried=(*self.carried, *(CARRIED if with_implicit else ()), *((DYE,) if self._with_dye else ())),
             sheets_answer=self.sheets_answer,
             looks_ahead=self.looks_ahead,
         )
         self.particles, self.boundary = self.tank.particles, self.tank.boundary
         self.body_forces = self.tank.body_forces
+        self.dye = Dye(start.fluids, self.discretization, self.particles.capacity) if self._with_dye else None
         self.gravity, self.spacing = start.gravity, self.discretization.spacing
         self.particle_volume = self.discretization.particle_volume
         self.forces = Forces(
@@ -141,7 +145,9 @@ class SPHFluid(ABC):
             record.clear()
 
     def advance(self, dt: float, frequency_squared: ti.Ndarray | None = None) -> None:
-        """Move the particles by their acceleration, for a step of dt [s]."""
+        """Let dye diffuse, and move the particles by their acceleration, for a step of dt [s]."""
+        if self.dye is not None:
+            self.dye.diffuse(self.particles, self.tank.on_device, dt)
         self.tank.advance(self.forces.acceleration, dt, frequency_squared)
         self._first_bad = self._first_bad or self._bad_motion()
 
@@ -152,7 +158,7 @@ class SPHFluid(ABC):
         return physical + self.forces.artificial_viscosity / LAPLACIAN_FACTOR * max(1.0, self.parameters.wall_friction)
 
     def snapshots(self) -> dict[str, Snapshot]:
-        """Positions, velocities, densities and pressures of the particles of each fluid, sorted by particle id."""
+        """Positions, velocities, densities, pressures and dye of the particles of each fluid, sorted by particle id."""
         self.compute_density()
         particles = self.particles
         order = particles.order_by_id()
@@ -165,10 +171,14 @@ class SPHFluid(ABC):
             "pressure": pressure[order],
             "particle_id": particles.host(particles.arrays.particle_id)[order],
         }
+        if self.dye is not None:
+            arrays[DYE] = particles.host(particles.carried[DYE])[order]
         snapshots = {}
         for number, fluid in enumerate(self.phases.parameters):
             own = {name: array[phase == number] for name, array in arrays.items()}
             own["density"] = own["density"] * np.float32(fluid.rest_density)
+            if not fluid.has_dye:
+                own.pop(DYE, None)
             attributes = {"particle_radius": fluid.particle_radius, "rest_density": fluid.rest_density}
             snapshots[fluid.name] = Snapshot(kind="fluid", arrays=own, attributes=attributes)
         return snapshots

@@ -14,7 +14,7 @@ from sim.core.motion.parameters import (
     placed_at_first_keyframe,
     require_ascending_times,
 )
-from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.fluid.inflow import Inflow
 from sim.fluid.traits import CFL_NUMBER, TRAITS, VISCOUS_NUMBER
 from sim.shapes.parameters import (
@@ -34,10 +34,14 @@ from sim.shapes.parameters import (
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
 
 
+_DYE = "Concentration of dye, from 0 to 1 [-], which has the colour dye_color of the fluid's material,"
+
+
 class FluidBlockParameters(Placement):
     """A volume filled with fluid at the start."""
 
     velocity: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Initial velocity [m/s].")
+    dye: Fraction = Field(default=0.0, description=f"{_DYE} at the start.")
 
 
 class DiscOpening(Parameters):
@@ -97,6 +101,7 @@ class EmitterParameters(Parameters):
         description="Its strength over time, as part of speed or flow_rate: linear between these points, and constant "
         "before and after them; 1 if omitted.",
     )
+    dye: Fraction = Field(default=0.0, description=f"{_DYE} of what flows in.")
     start_s: NonNegative = Field(default=0.0, description="When it starts to emit [s].")
     end_s: Positive | None = Field(default=None, description="When it stops [s]; never if omitted.")
     total_volume: Positive | None = Field(
@@ -199,6 +204,11 @@ class FluidParameters(Parameters):
         description="Support radius h of the kernel over the lattice spacing 2r [-]: 2 gives 32 neighbours, 4 gives "
         "250 and smoother fields, at eight times the cost; from 3 on particles at rest gather in clumps.",
     )
+    dye_diffusivity: NonNegative = Field(
+        default=5.0e-10,
+        description="Diffusivity of the dye between its particles [m²/s]: of dyes in water 3e-10 to 1e-9, so that they "
+        "mix by flow alone; more stands for swirls that are finer than the particles.",
+    )
     rest_density: Positive = Field(default=1000.0, description="Rest density [kg/m³].")
     viscosity: NonNegative = Field(default=1.0e-6, description="Kinematic viscosity nu [m²/s]; water 1e-6.")
     artificial_viscosity: NonNegative = Field(
@@ -264,6 +274,11 @@ class FluidParameters(Parameters):
         return self.spacing**3
 
     @property
+    def has_dye(self) -> bool:
+        """Whether some of it starts, or flows in, with a dye."""
+        return any(each.dye > 0.0 for each in (*self.block, *self.emitter))
+
+    @property
     def most_volume(self) -> float:
         """Volume that `max_particles` take [m³]; infinite without that key."""
         return math.inf if self.max_particles is None else self.max_particles * self.lattice_volume
@@ -281,11 +296,22 @@ class FluidParameters(Parameters):
             raise ValueError(f'sound_speed is for solver = {WITH_SOUND_SPEED}; remove it, as "{self.solver}" has none')
         if self.adhesion and self.surface_tension_model != "akinci2013":
             raise ValueError('adhesion needs surface_tension_model = "akinci2013"; remove it or name that model')
+        dyes = {each.dye for each in (*self.block, *self.emitter)}
+        if len(dyes) == 1 and dyes != {0.0}:
+            raise ValueError(
+                f"has a dye of {dyes.pop():g} everywhere, and nothing to mix with; give a block or an emitter another "
+                "one, or remove dye and name the color of its material"
+            )
+        if dyes == {0.0} and "dye_diffusivity" in self.model_fields_set:
+            raise ValueError("dye_diffusivity has no meaning without dye; remove it or give a block or emitter a dye")
         return self
 
 
 OWN_KEYS = frozenset(
-    ("name", "block", "emitter", "max_particles", "rest_density", "viscosity", "surface_tension", "adhesion")
+    (
+        *("name", "block", "emitter", "max_particles", "rest_density", "viscosity", "surface_tension", "adhesion"),
+        "dye_diffusivity",
+    )
 )
 """Keys that each fluid of a tank has of its own; all else is shared, as they share particles, steps and walls."""
 

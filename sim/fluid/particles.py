@@ -114,11 +114,14 @@ class ParticleSet:
         for name, array in self.carried.items():
             array.from_numpy(_padded(arrays.get(name, np.zeros(count, dtype=np.float32)), self.capacity))
 
-    def append(self, layer: Layer, added: int) -> None:
-        """Add the particles of the places to take, as many as `added`; without neighbours before the next sort."""
+    def append(self, layer: Layer, added: int, carried: Mapping[str, float]) -> None:
+        """Add the particles of the places to take, as many as `added`; without neighbours before the next sort.
+
+        Carried scalars are those given by name, and 0 where there is none of the name.
+        """
         append_particles(layer, self.arrays)
-        for values in self.carried.values():
-            clear_scalars(values, self.count, added)
+        for name, values in self.carried.items():
+            fill_scalars(values, self.count, added, carried.get(name, 0.0))
         self.arrays = self.arrays._replace(count=self.count + added)
 
     def host_arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -187,10 +190,10 @@ def append_particles(layer: Layer, particles: Particles):
 
 
 @kernel
-def clear_scalars(values: Floats, first: ti.i32, count: ti.i32):
-    """Zeros for a carried quantity of new particles."""
+def fill_scalars(values: Floats, first: ti.i32, count: ti.i32, value: ti.f32):
+    """One value for a carried quantity of new particles."""
     for i in range(first, first + count):
-        values[i] = 0.0
+        values[i] = value
 
 
 @bundle

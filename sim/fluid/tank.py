@@ -13,6 +13,7 @@ from sim.core.neighbors import cells_per_radius
 from sim.fluid.body_forces import BodyForces
 from sim.fluid.boundary import BodyStates, Boundary, at_origin, states_of
 from sim.fluid.boundary_akinci2012 import BoundarySamples
+from sim.fluid.dye import DYE
 from sim.fluid.emitter import Carrier, Emission
 from sim.fluid.kernels import Discretization
 from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
@@ -47,6 +48,7 @@ class FluidStart:
     velocities: NDArray[np.float32]  # [m/s], (n, 3), float32
     boundary: BoundarySamples  # of walls and of bodies that never move
     phase: NDArray[np.int32] | None = None  # number of the fluid of each particle, (n,); 0 for all if omitted
+    dye: NDArray[np.float32] | None = None  # concentration in each particle [-], (n,), float32; 0 for all if omitted
     moving: BoundarySamples = field(default_factory=BoundarySamples.of_bodies)  # about the centre of mass of each body
     sheets: SheetSamples | None = None
     body_count: int = 0  # moving bodies
@@ -143,6 +145,7 @@ class ParticleTank:
                 "velocity": np.ascontiguousarray(start.velocities, dtype=np.float32),
                 "particle_id": np.arange(count, dtype=np.int32),
                 "phase": np.zeros(count, np.int32) if start.phase is None else start.phase.astype(np.int32),
+                DYE: np.zeros(count, np.float32) if start.dye is None else start.dye.astype(np.float32),
             }
         )
         self.last_speed = float(np.sqrt((np.asarray(start.velocities, np.float64) ** 2).sum(axis=1).max(initial=0.0)))

@@ -37,6 +37,7 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
     _check_bodies(job, findings)
     _check_whitewater(job, findings)
     _check_materials(job, findings)
+    _check_dye(job, findings)
     _check_time(job, findings)
     _check_pictures(job, findings)
     check_set(job, findings)
@@ -100,6 +101,33 @@ def _check_materials(job: Job, findings: Findings) -> None:
                 check_keys_beside_blend(said, path, findings)
             elif material.look is not None:
                 _check_look(job, material, path, name, kinds[name], findings=findings)
+
+
+def _check_dye(job: Job, findings: Findings) -> None:
+    """Warn of dye that no picture shows, and of the colour of a dye that is not there."""
+    dyed = {fluid.name for fluid in job.fluid if fluid.has_dye}
+    cloudy = [name for name, row in LOOK_TABLE.items() if "dye_color" in row.keys]
+    for index, fluid in enumerate(job.fluid):
+        material = described_material(job, fluid.name)
+        if fluid.name not in dyed or material.look is None:
+            continue
+        if material.look not in cloudy:
+            findings.warn(
+                ("fluid", index),
+                f'has dye, and its look "{material.look}" does not show it: the colour of a clear liquid is that of '
+                f"its depth, and dye is drawn on surfaces alone; use {quoted_list(cloudy)}, or read it from the frames",
+            )
+        elif material.dye_color is None:
+            findings.warn(
+                ("fluid", index), f"has dye, and no picture shows it; add dye_color to [material.{fluid.name}]"
+            )
+    for written, said in job.material.items():
+        meant = [body.name for _, _, body in bodies(job) if is_meant(written, body.name)]
+        if said.dye_color is not None and meant and not dyed & set(meant):
+            findings.warn(
+                ("material", written, "dye_color"),
+                f'has no effect, as "{meant[0]}" has no dye; give a [[fluid.block]] or [[fluid.emitter]] of it a dye',
+            )
 
 
 def _check_look(

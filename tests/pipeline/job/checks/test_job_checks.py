@@ -183,3 +183,32 @@ def test_mesh_without_faces_and_mesh_with_holes_are_told_apart(tmp_path):
     assert errors == []
     assert len(warnings) == 1
     assert "hole" in warnings[0]
+
+
+DYED = (
+    WATER + '[[fluid.block]]\nshape = { type = "box", size = [0.1, 0.1, 0.1] }\nposition = [0.3, 0.3, 0.1]\ndye = 1.0\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (DYED, 'fluid[0]: has dye, and its look "water" does not show it ... "milk", "juice" or "muddy_water"'),
+        (DYED + '[material.water]\nlook = "milk"\n', "fluid[0]: has dye ... add dye_color to [material.water]"),
+        (
+            WATER + '[material.water]\nlook = "milk"\ndye_color = [0.5, 0.0, 0.0]\n',
+            'material.water.dye_color: has no effect, as "water" has no dye ... [[fluid.block]]',
+        ),
+    ],
+)
+def test_dye_that_no_picture_shows_is_told(text, expected, tmp_path):
+    errors, warnings, _ = checked(HEAD + text, tmp_path / "dam.toml")
+    assert errors == []
+    assert any(says(warning.partition(" ")[2], expected) for warning in warnings), warnings
+
+
+def test_dye_in_milk_with_its_colour_passes_without_a_word(tmp_path):
+    text = DYED + '[material.water]\nlook = "milk"\ndye_color = [0.5, 0.0, 0.0]\n'
+    errors, warnings, _ = checked(HEAD + text, tmp_path / "dam.toml")
+    assert errors == []
+    assert not [warning for warning in warnings if "dye" in warning]

@@ -1,0 +1,41 @@
+"""The surface of a fluid with dye, as its file has it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.job.loading import job_of_text
+from pipeline.kinds.fluid import SURFACE
+from render.meshes import read_ply
+from sim.core.snapshots import Snapshot
+
+JOB = """
+name = "pool"
+[[fluid]]
+name = "milk"
+particle_radius = 0.01
+[[fluid.block]]
+shape = { type = "box", size = [0.2, 0.1, 0.1] }
+"""
+RADIUS = 0.01
+
+
+@pytest.mark.parametrize("is_dyed", [True, False])
+def test_a_vertex_has_the_dye_of_the_particles_around_it(is_dyed, tmp_path):
+    axes = [RADIUS * (2 * np.arange(count) + 1) for count in (12, 6, 6)]
+    position = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+    arrays = {"position": position, "velocity": np.zeros_like(position)}
+    if is_dyed:
+        arrays["dye"] = (position[:, 0] < 0.12).astype(np.float32)
+    fluid = Snapshot(kind="fluid", arrays=arrays, attributes={"particle_radius": RADIUS, "rest_density": 1000.0})
+    job = job_of_text(JOB, tmp_path / "pool.toml")
+    SURFACE.write(tmp_path / "milk.ply", fluid, job, 1)
+    mesh = read_ply(tmp_path / "milk.ply")
+    if not is_dyed:
+        assert mesh.dye is None
+        return
+    x, dye = mesh.vertices[:, 0], mesh.dye[:, 0]
+    assert (dye[x < 0.07] == 1.0).all() and (dye[x > 0.17] == 0.0).all()
+    between = dye[np.abs(x - 0.12) < 0.005]
+    assert 0.2 < between.mean() < 0.8
