@@ -16,6 +16,7 @@ from sim.fluid.dye import DYE, Dye
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
 from sim.fluid.kernels import Discretization
+from sim.fluid.mechanical_pressure import MechanicalPressure
 from sim.fluid.opening import openings_of
 from sim.fluid.parameters import is_implicit
 from sim.fluid.particles import Phases
@@ -106,6 +107,7 @@ class SPHFluid(ABC):
             speed_ratio=self.speed_ratio,
             with_implicit=with_implicit,
         )
+        self._mechanical_pressure = MechanicalPressure(self.particles, self.discretization)
         self.solves = {name: SolveRecord() for name in self.solved_for}
         if self.forces.implicit_viscosity is not None:
             self.solves = {"viscosity": self.forces.implicit_viscosity.record} | self.solves
@@ -163,12 +165,11 @@ class SPHFluid(ABC):
         particles = self.particles
         order = particles.order_by_id()
         phase = particles.host(particles.arrays.phase)[order]
-        pressure = (particles.host(self.pressure_term) * particles.host(particles.density) ** 2).astype(np.float32)
         arrays = {
             "position": particles.host(particles.position)[order],
             "velocity": particles.host(particles.velocity)[order],
             "density": particles.host(particles.density)[order],
-            "pressure": pressure[order],
+            "pressure": self._mechanical_pressure.of(self.tank.on_device, self.pressure_term)[order],
             "particle_id": particles.host(particles.arrays.particle_id)[order],
         }
         if self.dye is not None:

@@ -153,6 +153,19 @@ def wall_layers(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> tuple[WallC
     )
 
 
+def wall_share(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Share of the bond between a sample of a wall and a particle of the first layer that lies in the fluid [-].
+
+    The wall's face is half a spacing from the particle. Of two layers of samples each counts as much as it pushes.
+    """
+    layers = wall_layers(support_in_spacings)
+    distances = np.array([layer.standoff_in_spacings for layer in layers])
+    pushes = [
+        layer.volume_in_particles * layer_field(layer.standoff_in_spacings, support_in_spacings)[1] for layer in layers
+    ]
+    return float(0.5 / np.average(distances, weights=pushes))
+
+
 def _calibration(standoff: float, volume_in_particles: float, support_in_spacings: float) -> WallCalibration:
     samples_sum, _ = layer_field(0.0, support_in_spacings, shifts=1)
     factor = volume_in_particles * samples_sum * particle_volume(1.0, support_in_spacings)
