@@ -7,6 +7,7 @@ import numpy as np
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.jets import check_jets
+from pipeline.kinds.checks.pressed_bodies import check_pressed_bodies
 from pipeline.kinds.checks.shapes import mesh_exists
 from pipeline.kinds.checks.vessels import check_vessels
 from pipeline.model.amounts import rounded_down, rounded_up
@@ -38,6 +39,7 @@ def check_fluids(job: Job, solids: Solids, findings: Findings) -> None:
         findings.error(("fluid", number, key), message)
     _check_overlaps(job, solids, findings)
     _check_thin_bodies(job, solids, findings)
+    check_pressed_bodies(job, solids, findings)
     openings: dict[KeyPath, Opening] = {}
     for index in range(len(job.fluid)):
         _check_speeds(job, index, findings)

@@ -386,3 +386,50 @@ def test_the_cap_of_a_fluid_is_of_all_its_emitters(cap, is_warned_of, tmp_path):
     text = HEAD + water + head + cap + "".join("[[fluid.emitter]]" + each for each in emitters)
     _, warnings, _ = checked(text, tmp_path / "tank.toml")
     assert any("overfills the domain" in warning for warning in warnings) == is_warned_of
+
+
+POOL = """
+[domain]
+min = [-0.2, -0.2, 0.0]
+max = [0.2, 0.2, 0.6]
+[[fluid]]
+name = "water"
+particle_radius = 0.01
+[[fluid.block]]
+shape = { type = "box", size = [0.4, 0.4, 0.24] }
+position = [0.0, 0.0, 0.12]
+"""
+
+
+def floater(shape: str, height: float, density: float, *, more: str = "") -> str:
+    return f"""
+[[rigid]]
+name = "floater"
+kind = "dynamic"
+density = {density}
+shape = {{ {shape} }}
+position = [0.0, 0.0, {height}]
+{more}"""
+
+
+BOX, TALL = ('type = "box", size = [0.1, 0.1, 0.08]', 'type = "box", size = [0.1, 0.1, 0.4]')
+BALL = 'type = "sphere", radius = 0.05'
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        (floater(BOX, 0.04, 300.0), "0.24 m of fluid"),
+        (floater(BOX, 0.05, 300.0), "or use particle_radius 0.005 m"),  # half a spacing: measured, it stays as well
+        (floater(BOX, 0.06, 300.0), None),  # a spacing: measured, it rises
+        (floater(BOX, 0.04, 1200.0), None),  # which lies there by its weight
+        (floater(BALL, 0.05, 300.0), None),  # measured, it rises
+        (floater(BOX, 0.04, 300.0, more="rotation_deg = [0.0, 30.0, 0.0]"), None),  # on an edge: below the floor
+        (floater(TALL, 0.2, 300.0), "0.24 m of fluid"),
+    ],
+)
+def test_a_light_body_that_starts_flush_on_the_floor_is_told_that_it_stays_there(body, told, tmp_path):
+    _, warnings, _ = checked(HEAD + POOL + body, tmp_path / "pool.toml")
+    pressed = [line for line in warnings if "stays on the floor" in line]
+    assert len(pressed) == (told is not None)
+    assert told is None or told in pressed[0]
