@@ -143,6 +143,8 @@ class SPHFluid(ABC):
     def begin_frame(self, time_s: float) -> None:  # noqa: ARG002  a fluid's counters do not depend on the time
         """Restart the counters of the frame, and its largest speed at the present one."""
         self.tank.begin_frame()
+        if self.forces.air is not None:
+            self.forces.air.begin_frame()
         for record in self.solves.values():
             record.clear()
 
@@ -241,6 +243,8 @@ class SPHFluid(ABC):
             counts = np.bincount(phase, minlength=len(self.phases))
             of_fluids = zip(self.phases.names, counts, strict=True)
             numbers |= {f"particle_count_{name}": float(count) for name, count in of_fluids}
+        if self.forces.air is not None:
+            numbers |= {f"air_impulse_{a}": float(each) for a, each in zip("xyz", self.forces.air.impulse, strict=True)}
         numbers |= self.tank.counters()
         numbers["squeezed"] = float(compression > SQUEEZED)
         if self.solves:

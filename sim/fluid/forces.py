@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle
 from sim.core.launch import kernel
+from sim.fluid.air_drag import AirDrag
 from sim.fluid.body_forces import Exerted
 from sim.fluid.body_friction import BodyFriction
 from sim.fluid.kernels import inverse_distance, spline_slope
@@ -40,7 +41,7 @@ class Elastic(NamedTuple):
 
 
 class Forces:
-    """Gravity, viscosity, surface tension, and pressure where it is known before the step.
+    """Gravity, viscosity, surface tension, drag of air, and pressure where it is known before the step.
 
     a_i = g - 1/rho0 [sum_j V (P_i + P_j) grad W_ij + sum_b V_b P_i grad W_ib] + viscosity + cohesion
 
@@ -51,6 +52,7 @@ class Forces:
         acceleration: of each particle [m/s²], (capacity,) of 3-vectors.
         artificial_viscosity: alpha c h/2 at most [m²/s], which stands where 2 (d + 2) nu does.
         implicit_viscosity: the solve for stiff fluids; None where viscosity is explicit.
+        air: drag of the air; None without air.
     """
 
     def __init__(
@@ -98,6 +100,7 @@ class Forces:
         self._akinci2013: SurfaceTensionAkinci2013 | None = None
         if cohesion.is_akinci2013:
             self._akinci2013 = SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, d)
+        self.air: AirDrag | None = AirDrag(phases.parameters, d) if parameters.air_density > 0.0 else None
         density = tank.particles.density
         self._no_pressure = Elastic(density, density, 0.0, False)
 
@@ -119,6 +122,8 @@ class Forces:
         compute_acceleration(self._fluid, pressure, self._viscosity, tank.gravity, spacing, cohesion, self.acceleration)
         if self._akinci2013 is not None:
             self._akinci2013.add_acceleration(tank.on_device, self.acceleration)
+        if self.air is not None:
+            self.air.add_acceleration(tank.on_device, self.acceleration, dt)
         self._begin_reaction(None if elastic is None else elastic.pressure_term, dt)
         self.add_implicit_viscosity(dt)
 

@@ -235,6 +235,12 @@ class FluidParameters(Parameters):
         default=0.0,
         description="Pull of walls and bodies as a multiple of the fluid's own cohesion [-], akinci2013 only.",
     )
+    air_density: NonNegative = Field(
+        default=0.0,
+        description="Density of the air that slows drops and sheets down [kg/m³], 1.2 at 20 degrees C; 0: none "
+        "(Gissler et al. 2017).",
+    )
+    wind: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Velocity of that air [m/s].")
     wall_friction: NonNegative = Field(
         default=0.0, description="Viscosity against walls and bodies, as a multiple of the fluid's own [-]."
     )
@@ -294,6 +300,8 @@ class FluidParameters(Parameters):
             raise ValueError("has neither a block nor an emitter; add [[fluid.block]] or [[fluid.emitter]]")
         if self.sound_speed is not None and not TRAITS[self.solver].has_sound_speed:
             raise ValueError(f'sound_speed is for solver = {WITH_SOUND_SPEED}; remove it, as "{self.solver}" has none')
+        if any(self.wind) and not self.air_density:
+            raise ValueError("wind moves nothing without air; set air_density, 1.2 kg/m³ for air, or remove wind")
         if self.adhesion and self.surface_tension_model != "akinci2013":
             raise ValueError('adhesion needs surface_tension_model = "akinci2013"; remove it or name that model')
         dyes = {each.dye for each in (*self.block, *self.emitter)}
@@ -341,6 +349,8 @@ def shared_conflicts(fluids: Sequence[FluidParameters]) -> list[tuple[int, str, 
 
 
 def _written(value: object) -> str:
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_written, value))})"
     return f'"{value}"' if isinstance(value, str) else "omitted" if value is None else f"{value:g}"
 
 
