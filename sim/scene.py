@@ -37,19 +37,6 @@ class SceneParameters(Parameters):
         return composed(document)
 
     @model_validator(mode="after")
-    def _has_reactions(self) -> Self:
-        sticky = [fluid.name for fluid in self.fluid if fluid.adhesion > 0.0]
-        free = [body.name for body in self.rigid if body.kind == "dynamic"]
-        if sticky and free:
-            index = next(number for number, fluid in enumerate(self.fluid) if fluid.name == sticky[0])
-            raise KeyRefusedError(
-                ("fluid", index, "adhesion"),
-                f'adhesion of "{sticky[0]}" has no reaction on bodies in this version, and would drive "{free[0]}" by '
-                'itself; set adhesion = 0, or make the bodies "static" or "kinematic"',
-            )
-        return self
-
-    @model_validator(mode="after")
     def _has_one_air(self) -> Self:
         if self.smoke and (conflict := conflict_in_one_air(self.cloth)):
             raise KeyRefusedError(*conflict)

@@ -1,5 +1,6 @@
 """Reaction of a particle fluid on the bodies and sheets that move in it."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,9 @@ from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
 from sim.fluid.particles import Fluid
 from sim.fluid.sheets import SheetForces, SheetReaction, answer_of_sheets, react_of_sheets
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, Viscosity, viscous_factor
+
+FillForces = Callable[[NearParticles, Bodies, ti.Ndarray], None]
+"""Fills the forces on all moving samples [N], given the particles near each and which samples are of bodies."""
 
 CHUNK = 64  # samples of a body that one node of the sum takes together
 KEPT = 8  # forces on the bodies that wait on the device until the host asks for all of them
@@ -157,6 +161,26 @@ class BodyForces:
         )
         self._kept_dt.append(dt)
         self._are_compiled = True
+
+    def gather_others(self, fill_forces: FillForces, samples: Samples, dt: float) -> None:
+        """Add the impulses on bodies of a step of dt [s] by forces on their samples other than `Exerted`."""
+        if self._boundary.body_sample_count == 0 or self.are_alone:
+            return
+        if len(self._kept_dt) == KEPT:
+            self._count_impulses()
+        response, bodies = self.response, self._boundary.bodies
+        fill_forces(self.near, bodies, self.summed.force)
+        react_to_others(
+            samples,
+            bodies,
+            self.summed.wrench if response is None else response.mobility,
+            self.summed,
+            self._kept,
+            len(self._kept_dt) * self._boundary.body_count * WRENCH_WIDTH,
+            dt,
+            response is not None,
+        )
+        self._kept_dt.append(dt)
 
     def respond(self, exerted: Exerted) -> ti.Ndarray:
         """Acceleration of each boundary sample by forces that are only tried [m/s²]; their impulses do not count."""
@@ -335,6 +359,25 @@ def answer_forces(
     accelerate(exerted.fluid.samples, bodies, summed.wrench, mobility, acceleration)
     if ti.static(with_sheets):
         answer_of_sheets(summed.force, sheets, sheet_mass, acceleration)
+
+
+@kernel
+def react_to_others(
+    samples: Samples,
+    bodies: Bodies,
+    mobility: Floats,
+    summed: Summed,
+    kept: Floats,
+    first: ti.i32,
+    dt: ti.f32,
+    bodies_answer: ti.template(),
+):
+    """Forces on samples of bodies that count, for dt [s]: kept from `first` on, and samples that answer move on."""
+    sum_over_bodies(samples, bodies, summed)
+    for entry in range(bodies.count * WRENCH_WIDTH):
+        kept[first + entry] = summed.wrench[entry]
+    if ti.static(bodies_answer):
+        push(samples, bodies, summed.wrench, mobility, ti.math.vec3(0.0), dt)
 
 
 @kernel

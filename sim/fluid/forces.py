@@ -1,6 +1,7 @@
 """Forces on the particles, whatever the solver finds their pressure by, and their reaction on bodies and sheets."""
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -99,7 +100,8 @@ class Forces:
             self._explicit_materials = phases.materials._replace(dynamic_viscosity=nothing)
         self._akinci2013: SurfaceTensionAkinci2013 | None = None
         if cohesion.is_akinci2013:
-            self._akinci2013 = SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, d)
+            attracting = tank.boundary.sheets.first
+            self._akinci2013 = SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, d, attracting)
         self.air: AirDrag | None = AirDrag(phases.parameters, d) if parameters.air_density > 0.0 else None
         density = tank.particles.density
         self._no_pressure = Elastic(density, density, 0.0, False)
@@ -120,8 +122,11 @@ class Forces:
         tank, pressure, cohesion = self._tank, elastic or self._no_pressure, self._cohesion.is_becker_teschner2007
         spacing = tank.discretization.spacing
         compute_acceleration(self._fluid, pressure, self._viscosity, tank.gravity, spacing, cohesion, self.acceleration)
-        if self._akinci2013 is not None:
-            self._akinci2013.add_acceleration(tank.on_device, self.acceleration)
+        if (attraction := self._akinci2013) is not None:
+            attraction.add_acceleration(tank.on_device, self.acceleration)
+            if attraction.adheres:
+                fill = partial(attraction.fill_forces, tank.on_device)
+                tank.body_forces.gather_others(fill, tank.boundary.samples, dt)
         if self.air is not None:
             self.air.add_acceleration(tank.on_device, self.acceleration, dt)
         self._begin_reaction(None if elastic is None else elastic.pressure_term, dt)

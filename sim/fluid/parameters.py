@@ -233,7 +233,8 @@ class FluidParameters(Parameters):
     )
     adhesion: NonNegative = Field(
         default=0.0,
-        description="Pull of walls and bodies as a multiple of the fluid's own cohesion [-], akinci2013 only.",
+        description="Pull of walls and bodies, and on them, as a multiple of the fluid's own cohesion [-]; not that "
+        "of cloth. akinci2013 only.",
     )
     air_density: NonNegative = Field(
         default=0.0,

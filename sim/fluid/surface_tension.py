@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
+from sim.fluid.boundary import Bodies, NearParticles
 from sim.fluid.kernels import (
     Discretization,
     evaluate,
@@ -88,6 +89,7 @@ class Attraction(NamedTuple):
 
     cohesion: Floats  # c [m/s²]
     adhesion: Floats  # beta [-]
+    samples: ti.i32  # boundary samples that attract: all but those of sheets
     with_adhesion: ti.template()  # whether any fluid has adhesion
 
 
@@ -98,24 +100,37 @@ class SurfaceTensionAkinci2013:
     n_i = h sum_j V/rho_j grad W_ij (eq. 4), K_ij = 2/(rho_i + rho_j) (eq. 5), with relative densities
 
     C (eq. 2) pulls beyond 0.37 h and pushes nearer than that; A (eq. 7) pulls between h/2 and h. Our support h is
-    theirs. Fluids attract their own kind alone. Momentum is conserved pair by pair; angular momentum is not, as
-    n_i - n_j is not along x_ij.
+    theirs. Fluids attract their own kind alone. Momentum is conserved pair by pair, that of bodies included; angular
+    momentum is not, as n_i - n_j is not along x_ij. Sheets do not attract.
+
+    Attributes:
+        adheres: whether walls and bodies attract any fluid.
     """
 
     def __init__(
-        self, capacity: int, fluids: tuple[FluidParameters, ...], cohesion: np.ndarray, discretization: Discretization
+        self,
+        capacity: int,
+        fluids: tuple[FluidParameters, ...],
+        cohesion: np.ndarray,
+        discretization: Discretization,
+        samples: int,
     ) -> None:
-        """Prepare for particles of these fluids, whose cohesion is c [m/s²], (k,)."""
+        """Prepare for particles of these fluids, whose cohesion is c [m/s²], (k,), and samples that may attract."""
         self._normal = ti.Vector.ndarray(3, ti.f32, capacity)
         self._discretization = discretization
         adhesion = np.array([fluid.adhesion for fluid in fluids])
-        self._attraction = Attraction(on_device(cohesion), on_device(adhesion), bool((adhesion > 0.0).any()))
+        self.adheres = bool((adhesion > 0.0).any())
+        self._attraction = Attraction(on_device(cohesion), on_device(adhesion), samples, self.adheres)
 
     def add_acceleration(self, fluid: Fluid, acceleration: ti.Ndarray) -> None:
         """Add the accelerations by surface tension to all others [m/s²]."""
         d = self._discretization
         compute_normals(fluid, d.sigma * d.particle_volume, self._normal)
         add_surface_tension(fluid, self._attraction, d.support_radius, self._normal, acceleration)
+
+    def fill_forces(self, fluid: Fluid, near: NearParticles, bodies: Bodies, force: ti.Ndarray) -> None:
+        """The opposite of the adhesion to each sample of a moving body [N]."""
+        gather_adhesion(fluid, self._attraction, self._discretization.support_radius, near, bodies, force)
 
 
 @func
@@ -188,9 +203,41 @@ def add_surface_tension(
             first += near.fluid_count[i] * near.stride
             for k in range(near.boundary_count[i]):
                 b = near.indices[first + k * near.stride]
-                x_ib = x_i - samples.position[b]
-                r_squared = x_ib.norm_sqr()
-                inverse_r = inverse_distance(r_squared)
-                pull = samples.volume[b] * per_volume * adhesion_akinci2013(r_squared * inverse_r * inverse_support)
-                total += attraction.adhesion[own] * pull * inverse_r * x_ib
+                if b < attraction.samples:
+                    x_ib = x_i - samples.position[b]
+                    pull = samples.volume[b] * per_volume * attraction.adhesion[own]
+                    total += pull * adhesion_towards(x_ib, inverse_support)
         acceleration[i] -= attraction.cohesion[own] * total
+
+
+@func
+def adhesion_towards(x_ib: ti.math.vec3, inverse_support: ti.f32) -> ti.math.vec3:
+    """A h³ along x_ib."""
+    r_squared = x_ib.norm_sqr()
+    inverse_r = inverse_distance(r_squared)
+    return adhesion_akinci2013(r_squared * inverse_r * inverse_support) * inverse_r * x_ib
+
+
+@kernel
+def gather_adhesion(
+    fluid: Fluid,
+    attraction: Attraction,
+    support_radius: ti.f32,
+    near: NearParticles,
+    bodies: Bodies,
+    force: Vectors,
+):
+    """Force of adhesion on each sample of a moving body [N]; 0 on those of sheets."""
+    particles, samples = ti.static((fluid.particles, fluid.samples))
+    inverse_support = 1.0 / support_radius
+    per_volume = fluid.volume * inverse_support * inverse_support * inverse_support
+    for b in range(near.sample_count):
+        total = ti.math.vec3(0.0)
+        if b < bodies.sample_count:
+            x_b = samples.position[near.first + b]
+            for k in range(near.start[b], near.start[b] + near.count[b]):
+                i = near.particles[k]
+                own = particles.phase[i]
+                pull = fluid.materials.rest_density[own] * attraction.cohesion[own] * attraction.adhesion[own]
+                total += pull * adhesion_towards(particles.position[i] - x_b, inverse_support)
+        force[b] = per_volume * samples.volume[near.first + b] * total

@@ -116,13 +116,3 @@ def test_a_body_that_reaches_out_of_the_domain_holds_the_fluid_back_inside():
     positions = world.snapshots()["water"].arrays["position"]
     inside_pillar = (positions[:, 0] < -0.35) & (np.abs(positions[:, 1]) < 0.1)
     assert not inside_pillar.any()
-
-
-def test_adhesion_beside_free_bodies_is_refused_as_it_has_no_reaction():
-    water = {"name": "water", "block": [{"shape": {"type": "box", "size": (0.1, 0.1, 0.1)}}]}
-    sticky = {**water, "surface_tension_model": "akinci2013", "surface_tension": 0.07, "adhesion": 1.0}
-    ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.05}}
-    SceneParameters.model_validate({"fluid": [sticky], "rigid": [ball]})
-    SceneParameters.model_validate({"fluid": [water], "rigid": [{**ball, "kind": "dynamic", "density": 500.0}]})
-    with pytest.raises(ValueError, match='adhesion of "water" has no reaction'):
-        SceneParameters.model_validate({"fluid": [sticky], "rigid": [{**ball, "kind": "dynamic", "density": 500.0}]})

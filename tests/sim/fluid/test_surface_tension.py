@@ -9,8 +9,12 @@ from scipy.spatial import ConvexHull
 from small_fluids import EVERY_FACE, lattice, make_fluid, run
 
 from sim.core.domain import DomainParameters
+from sim.fluid.boundary import at_origin
+from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.parameters import FluidParameters
+from sim.fluid.solvers import SOLVERS
 from sim.fluid.surface_tension import cohesion_rate, cohesion_stress, cohesion_stress_akinci2013
+from sim.fluid.tank import FluidStart
 
 SPACING = 1.0e-3
 SPACE = DomainParameters(min=(-0.02,) * 3, max=(0.02,) * 3, open_faces=EVERY_FACE)
@@ -118,6 +122,41 @@ def test_walls_pull_by_adhesion(taichi_cpu):
         return float(fluid.snapshots()["water"].arrays["velocity"][:, 2].mean())
 
     assert pull(1.0) < pull(0.0)
+
+
+@pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])
+def test_a_body_gets_the_momentum_that_adhesion_gives_the_fluid(taichi_cpu, solver):
+    plate = lattice((-0.004, -0.004, -0.001), (0.004, 0.004, 0.0), SPACING) - np.float32((0.0, 0.0, 0.5 * SPACING))
+    particles = lattice((-0.002, -0.002, 0.0), (0.002, 0.003, 0.002), SPACING) + np.float32((0.0, 0.0, 0.1 * SPACING))
+    material = {
+        "name": "water",
+        "solver": solver,
+        "block": [{"shape": {"type": "sphere", "radius": 1}}],
+        "particle_radius": SPACING / 2,
+        "surface_tension_model": "akinci2013",
+        "surface_tension": WATER,
+        "adhesion": 2.0,
+        "artificial_viscosity": 0.0,
+    }
+    start = FluidStart(
+        (FluidParameters.model_validate(material),),
+        domain=SPACE,
+        gravity=(0.0, 0.0, 0.0),
+        positions=particles,
+        velocities=np.zeros_like(particles),
+        boundary=BoundarySamples.of_bodies(),
+        moving=BoundarySamples.of_bodies(plate),
+        body_count=1,
+    )
+    fluid = SOLVERS[solver](start)
+    fluid.tank.move_bodies(at_origin(1), elapsed_s=0.0)
+    for _ in range(10):  # more than forces wait for together
+        fluid.substep(1.0e-5)
+    impulse, _ = fluid.body_forces.take_impulses()
+    momentum = np.array([fluid.diagnostics()[f"momentum_{axis}"] for axis in "xyz"])
+    assert momentum[2] < 0.0  # it is pulled onto the plate, which is pulled up
+    # Sums of float32, over hundreds of pairs.
+    np.testing.assert_allclose(impulse[0], -momentum, atol=1e-5 * abs(momentum[2]))
 
 
 def test_adhesion_without_its_model_is_refused():
