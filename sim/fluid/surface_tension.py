@@ -22,8 +22,8 @@ from sim.fluid.kernels import (
 )
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid
+from sim.fluid.traits import COHESION_PER_TENSION
 
-COHESION_PER_TENSION = 100.0  # c [m/s²] over sigma/(rho0 h²) of drops that oscillate as Rayleigh's do; measured
 RATE_PER_COHESION = 1.0  # squared frequency on cohesion's springs over c/h: six neighbours, each of 0.135/h at most
 AREA_SHARE = 1.0e-3
 """Coefficient of the area forces over that of cohesion, both as accelerations. The paper has one gamma for both: its

@@ -5,10 +5,11 @@ import math
 import numpy as np
 
 from pipeline.kinds.base import Solids
+from pipeline.model.amounts import rounded_down, rounded_up
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 from sim.fluid.parameters import FluidParameters
-from sim.fluid.traits import TRAITS
+from sim.fluid.traits import TRAITS, tension_step
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
 from sim.shapes.solid import Solid
@@ -23,12 +24,17 @@ WALL_FRICTION_AT_IMPACTS = 1.0
 ARTIFICIAL_VISCOSITY_AT_IMPACTS = 0.1
 
 
+SLOWED_BY_TENSION = 4.0
+"""Steps that surface tension asks for over those of the flow from which on it is worth a warning."""
+
+
 def check_time_steps(job: Job, solids: Solids, findings: Findings) -> None:
-    """Warn of fixed steps above what will be stable, in the flow or where it hits a wall."""
+    """Warn of fixed steps above what will be stable, in the flow or where it hits a wall, and of stiff surfaces."""
     for index, fluid in enumerate(job.fluid):
-        if fluid.dt == "adaptive":
-            continue
         speed = expected_speed(job, solids)
+        if fluid.dt == "adaptive":
+            _check_tension(job, index, _dt_of_flow(job, fluid, speed), findings)
+            continue
         stable, bearing = stable_dt(job, fluid, speed), _dt_bearing_impacts(fluid, speed)
         if fluid.dt > stable:
             findings.warn(
@@ -68,7 +74,28 @@ def _body_speed(body: RigidBodyParameters, solid: Solid, fall: float) -> float:
     return math.sqrt(fall + math.hypot(*body.velocity) ** 2) + math.hypot(*body.angular_velocity) * reach
 
 
+def _check_tension(job: Job, index: int, of_flow: float, findings: Findings) -> None:
+    """Warn of a surface tension whose steps are much shorter than those of the flow, of_flow [s]."""
+    fluid = job.fluid[index]
+    allowed = tension_step(fluid)
+    slower = of_flow / allowed
+    if slower > SLOWED_BY_TENSION:
+        # Steps go as the root of the tension, and as d^1.5 where those of the flow go as d.
+        bearable = rounded_down(fluid.surface_tension * (SLOWED_BY_TENSION / slower) ** 2)
+        radius = rounded_up(fluid.particle_radius * (slower / SLOWED_BY_TENSION) ** 2)
+        findings.warn(
+            ("fluid", index, "surface_tension"),
+            f"asks for steps of {allowed:.2g} s, {1.0 / (job.fps * allowed):,.0f} a frame, {slower:.2g} times as many "
+            f"as the flow; use {bearable:g} or less, or particle_radius {radius:g} m or more",
+        )
+
+
 def stable_dt(job: Job, fluid: FluidParameters, speed: float) -> float:
+    """Largest step [s] at a largest speed [m/s], by the flow and by the surface tension of all fluids."""
+    return min(_dt_of_flow(job, fluid, speed), *map(tension_step, job.fluid))
+
+
+def _dt_of_flow(job: Job, fluid: FluidParameters, speed: float) -> float:
     """Largest step [s] at a largest speed [m/s], by signals, cfl k d / (c_s + v), and by gravity."""
     traits, gravity = TRAITS[fluid.solver], math.hypot(*job.gravity)
     signal_speed = _speed_of_sound(fluid, speed) + speed
