@@ -32,19 +32,23 @@ class Parameters(BaseModel):
 
 
 class SurfaceParameters(Parameters):
-    """How particles become a surface (Löschner et al. 2023, splashsurf)."""
+    """How particles become a surface and spray (Löschner et al. 2023, splashsurf)."""
 
     smoothing_length_in_radii: Positive = Field(default=2.0, description="SPH smoothing length [particle radii].")
     cube_size_in_radii: Positive = Field(default=0.75, description="Edge of a marching-cubes cell [particle radii].")
     threshold: Positive = Field(default=0.6, description="Iso-value of the density, relative to the rest density [-].")
     mesh_smoothing_iterations: int = Field(default=25, ge=0, description="Weighted Laplacian smoothing passes [-].")
     normals_smoothing_iterations: int = Field(default=10, ge=0, description="Smoothing passes on the normals [-].")
-    droplet_size: float = Field(
-        default=0.5,
-        gt=0.0,
-        le=1.0,
-        description="Width of a droplet of a single particle, relative to its contour [-]; parts of up to 8 particles "
-        "lie in between. 1 leaves them as they are.",
+    drop_diameter: Positive = Field(
+        default=2.7e-3,
+        description="Mean diameter of the drops that spray breaks up into [m]; the capillary length of water.",
+    )
+    drops_per_particle: int = Field(
+        default=40,
+        ge=0,
+        le=1000,
+        description="Most drops that a particle of spray is drawn as; they are larger than `drop_diameter` where it "
+        "would take more. 0: nothing breaks up, and lone particles are drawn as balls. [-]",
     )
 
 

@@ -3,20 +3,28 @@
 The density of the particles is sampled on a grid and contoured by marching cubes, the contour's slivers are collapsed
 (Moore & Warren 1992), and a Laplacian smoothing that spares isolated droplets removes the particles' bumps (Löschner,
 Böttcher, Jeske & Bender 2023, "Weighted Laplacian Smoothing for Surface Reconstruction of Particle-based Fluids").
-splashsurf does the work; droplets of a few particles are then drawn finer than they came out (`render.droplets`).
+splashsurf does the work. Before it, thin sheets and threads get further samples (`render.sheets`); after it, the
+surface is moved along its normals until it encloses as much as the particles stand for.
 """
 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from render.droplets import shrink_droplets
 from render.meshes import SurfaceMesh
 from render.parameters import SurfaceParameters
+from render.sheets import samples_between
+
+LARGEST_SHIFT_IN_RADII = 0.6
+"""How far a surface is moved at most, so that no thin part is turned inside out."""
+_ROUNDS = 8
+_FITTED = 1e-4
+"""Share of the volume that may be lacking in the end [-]."""
 
 
 class SurfaceReconstructionError(Exception):
@@ -29,6 +37,8 @@ def reconstruct_surface(
     *,
     particle_radius: float,
     parameters: SurfaceParameters,
+    is_thin: NDArray[np.bool_] | None = None,
+    volume: float | None = None,
     threads: int = 1,
 ) -> SurfaceMesh:
     """Mesh the surface of a fluid.
@@ -41,6 +51,8 @@ def reconstruct_surface(
         velocities: particle velocities [m/s], (n, 3).
         particle_radius: [m], half the spacing of the particles at rest.
         parameters: how the particles become a surface.
+        is_thin: which particles lie in sheets and threads, (n,); none if omitted.
+        volume: that the surface is to enclose [m³]; as it comes if omitted. See `with_volume`.
         threads: how many threads to use; fixed by the first call in a process.
 
     Returns:
@@ -57,11 +69,17 @@ def reconstruct_surface(
     if len(position_rows) == 0:
         nothing = np.empty((0, 3), np.float32)
         return SurfaceMesh(nothing, np.empty((0, 3), np.int32), nothing, nothing)
+    thin = np.zeros(len(position_rows), bool) if is_thin is None else is_thin
+    between = np.flatnonzero(thin)[samples_between(position_rows[thin], 2.0 * particle_radius)]
+    samples, sample_velocities, thinness = (
+        np.concatenate([rows, rows[between].mean(axis=1, dtype=np.float32)])
+        for rows in (position_rows, velocity_rows, thin.astype(np.float32))
+    )
     splashsurf = _with_thread_pool(threads)
     try:
         reconstructed, _ = splashsurf.reconstruction_pipeline(
-            position_rows,
-            attributes_to_interpolate={"velocity": velocity_rows},
+            samples,
+            attributes_to_interpolate={"velocity": sample_velocities, "thinness": thinness},
             particle_radius=particle_radius,
             multi_threading=threads > 1,
             **pipeline_options(parameters),
@@ -69,15 +87,60 @@ def reconstruct_surface(
     except RuntimeError as error:
         raise SurfaceReconstructionError(f"splashsurf failed on {len(position_rows)} particles: {error}") from error
     attributes = reconstructed.point_attributes
-    mesh = without_collapsed_parts(
-        SurfaceMesh(
-            vertices=np.array(reconstructed.mesh.vertices, np.float32),
-            faces=np.array(reconstructed.mesh.triangles, np.int32),
-            normals=np.array(attributes["normals"], np.float32),
-            velocities=np.array(attributes["velocity"], np.float32),
-        )
+    mesh = SurfaceMesh(
+        vertices=np.array(reconstructed.mesh.vertices, np.float32),
+        faces=np.array(reconstructed.mesh.triangles, np.int32),
+        normals=np.array(attributes["normals"], np.float32),
+        velocities=np.array(attributes["velocity"], np.float32),
     )
-    return shrink_droplets(mesh, position_rows, particle_radius=particle_radius, size=parameters.droplet_size)
+    if volume is not None:
+        mesh = with_volume(mesh, volume, attributes["thinness"], particle_radius=particle_radius)
+    return without_collapsed_parts(mesh)
+
+
+def with_volume(
+    mesh: SurfaceMesh, volume: float, thinness: NDArray[np.floating], *, particle_radius: float
+) -> SurfaceMesh:
+    """Move a closed surface along its normals until it encloses a volume [m³], as far as that goes.
+
+    Contour and smoothing take most from what is thin or curved: sheets and threads, (n,) between 0 and 1 at the
+    vertices, are moved first, and the rest only by what is lacking then. No vertex moves farther than
+    `LARGEST_SHIFT_IN_RADII`, and none without a normal.
+    """
+    if not len(mesh.faces):
+        return mesh
+    assert mesh.normals is not None
+    corners, directions = mesh.vertices.astype(np.float64), np.nan_to_num(mesh.normals.astype(np.float64))
+    largest = LARGEST_SHIFT_IN_RADII * particle_radius
+    shift = np.zeros(len(corners))
+    for weights in (np.clip(thinness, 0.0, 1.0).astype(np.float64), np.ones(len(corners))):
+        for _ in range(_ROUNDS):
+            moved = corners + shift[:, None] * directions
+            areas = _area_vectors(moved, mesh.faces)
+            lacking = volume - np.einsum("ij,ij->", moved[mesh.faces[:, 0]], areas) / 3.0
+            if abs(lacking) <= _FITTED * volume:
+                break
+            # d(volume) = sum over vertices of a third of the areas around it . its direction
+            around = np.stack(
+                [
+                    np.bincount(mesh.faces.reshape(-1), np.repeat(column, 3), minlength=len(corners))
+                    for column in areas.T
+                ],
+                axis=1,
+            )
+            gain = np.einsum("ij,ij->i", around, directions) / 3.0
+            movable = weights * ((shift < largest) if lacking > 0.0 else (shift > -largest))
+            total = float(movable @ gain)
+            if total <= 0.0:
+                break
+            shift = np.clip(shift + lacking / total * movable, -largest, largest)
+    return replace(mesh, vertices=(corners + shift[:, None] * directions).astype(np.float32))
+
+
+def _area_vectors(corners: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Area of each triangle times its normal [m²], (m, 3)."""
+    a, b, c = (corners[faces[:, corner]] for corner in range(3))
+    return np.asarray(0.5 * np.cross(b - a, c - a))
 
 
 def without_collapsed_parts(mesh: SurfaceMesh) -> SurfaceMesh:

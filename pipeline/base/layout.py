@@ -110,6 +110,8 @@ class JobLayout:
     picture = staticmethod(_of_frame("frames", ".png"))
     master = staticmethod(_of_frame("frames", ".exr"))  # rendered frame in linear light, with its passes
     surface = staticmethod(_of_body("surfaces", ".ply"))
+    liquid = staticmethod(_of_body("liquid", ".h5"))  # what each particle of a fluid stands for
+    drops = staticmethod(_of_body("drops", ".ply"))  # points of what its spray breaks up into
     whitewater = staticmethod(_of_body("whitewater", ".ply"))  # points of a fluid's spray, foam and bubbles
 
     @staticmethod

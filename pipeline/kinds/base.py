@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import LiveParameters
 from pipeline.model.boxes import Box
@@ -82,6 +83,8 @@ class Product:
     memory_bytes: Callable[[Job, Any], int]  # memory of a task
     write: Callable[[Path, Any, Job, int], None]  # makes the file of a body, with so many threads
     validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError
+    # files of the body and frame that hold further arrays of it, in the format of the cache
+    also_reads: Callable[[str, int], tuple[ArtifactPath, ...]] = lambda _body, _frame: ()
     file_bytes: Callable[[float], float]  # about the size of a file by the number of the body's elements
     about: str = ""  # what they are, in a few words for people
     # work of a file of a job's body of so many elements

@@ -40,6 +40,8 @@ WETS_WITHIN_RADII = 1.5
 WORKER_BYTES = 100_000_000
 BYTES_PER_SURFACE_PARTICLE = 140_000
 """Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`."""
+SHEET, SPRAY = 1, 2
+"""Values of the array `liquid` (`sim.whitewater.liquid.LiquidKind`), which takes scipy to import."""
 CUBE_SIZE = 0.75
 """In radii. Cubes of half the width need four times the memory."""
 
@@ -79,6 +81,13 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
         material=material,
         wets_within=WETS_WITHIN_RADII * fluid.particle_radius if sees else None,
     )
+    # Drops of a clear liquid are too small to refract in a picture; those of others look like it.
+    yield PointSequenceObject(
+        name=f"{fluid.name}.drops",
+        file=f"drops/{fluid.name}/{{frame}}.ply",
+        kind="spray",
+        material=material_of("spray") if sees else material,
+    )
     for kind in WHITEWATER if fluid.name in job.whitewater else ():
         yield PointSequenceObject(
             name=f"{fluid.name}.{kind}",
@@ -103,16 +112,12 @@ def _reach(_job: Job, _layout: JobLayout, _fluid: FluidParameters, group: h5py.G
 # --- the surface of a frame ---
 
 
-def _surface_tools(job: Job) -> dict[str, str]:
-    names = ("pysplashsurf",) if job.surface.droplet_size == 1.0 else ("pysplashsurf", "scipy")
-    return {name: tool_version(name) for name in names}
+def _surface_tools(_job: Job) -> dict[str, str]:
+    return {name: tool_version(name) for name in ("pysplashsurf", "scipy")}
 
 
 def _surface_parameters(job: Job) -> dict[str, Any]:
-    surface = job.surface.model_dump(mode="json")
-    if job.surface.droplet_size == 1.0:
-        del surface["droplet_size"]  # droplets are as earlier versions left them, and so is the file
-    return {"surface": surface}
+    return {"surface": job.surface.model_dump(mode="json", exclude={"drop_diameter", "drops_per_particle"})}
 
 
 def _surface_memory(job: Job, fluid: FluidParameters) -> int:
@@ -124,11 +129,15 @@ def _surface_memory(job: Job, fluid: FluidParameters) -> int:
 
 
 def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
+    meshed = fluid.arrays["liquid"] != SPRAY
+    radius = fluid.number("particle_radius")
     surface = reconstruct_surface(
-        fluid.arrays["position"],
-        fluid.arrays["velocity"],
-        particle_radius=fluid.number("particle_radius"),
+        fluid.arrays["position"][meshed],
+        fluid.arrays["velocity"][meshed],
+        particle_radius=radius,
         parameters=job.surface,
+        is_thin=fluid.arrays["liquid"][meshed] == SHEET,
+        volume=len(meshed) * (2.0 * radius) ** 3 - fluid.number("volume_of_drops"),
         threads=threads,
     )
     dye, radius = fluid.arrays.get("dye"), fluid.number("particle_radius")
@@ -145,7 +154,7 @@ def _facts(fluid: FluidParameters, count: float | None) -> str:
 SURFACE = Product(
     stage="surface",
     about="surfaces of fluids",
-    version=2,
+    version=3,
     folder="surfaces",
     suffix=".ply",
     tools=_surface_tools,
@@ -153,6 +162,7 @@ SURFACE = Product(
     memory_bytes=_surface_memory,
     write=_write_surface,
     validate=validate_ply,
+    also_reads=lambda fluid, frame: (JobLayout.liquid(fluid, frame),),
     file_bytes=lambda particles: 4_500.0 * particles ** (2 / 3),
     work=surface_work,
 )

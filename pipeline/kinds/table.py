@@ -128,6 +128,12 @@ def products_of(job: Job, layout: JobLayout, frame: int) -> list[tuple[Kind, Any
     ]
 
 
+def points_of(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:
+    """Files of the points of each frame: drops of fluids, and whitewater."""
+    drops = [layout.drops(fluid.name, frame) for fluid in job.fluid]
+    return drops + [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+
+
 _RANKS: dict[type, int] = {
     MeshObject: 0,
     MovingMeshObject: 0,

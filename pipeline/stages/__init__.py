@@ -16,6 +16,7 @@ from pipeline.stages.movie import MovieStage
 from pipeline.stages.product import ProductStage
 from pipeline.stages.render import RenderStage
 from pipeline.stages.simulate import SimulateStage
+from pipeline.stages.spray import SprayStage
 from pipeline.stages.whitewater import WhitewaterStage
 
 EXPORTS: dict[str, ExportStage] = {
@@ -28,7 +29,7 @@ class _Stages(Sequence[Stage]):
     """The stages, those of the products of all kinds of bodies among them: the table of kinds may grow."""
 
     def _all(self) -> tuple[Stage, ...]:
-        before: tuple[Stage, ...] = (BodiesStage(), SimulateStage())
+        before: tuple[Stage, ...] = (BodiesStage(), SimulateStage(), SprayStage())
         products = (ProductStage(kind, kind.product) for kind in KINDS.values() if kind.product is not None)
         return (*before, *products, WhitewaterStage(), BoundsStage(), *EXPORTS.values(), RenderStage(), MovieStage())
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
-from pipeline.kinds.table import products_of
+from pipeline.kinds.table import points_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, meshes_of
@@ -167,7 +167,7 @@ class AbcExport(_SceneExport):
 def _played(job: Job, layout: JobLayout, frame: int, *, volumes: bool) -> list[ArtifactPath]:
     """Files of a frame that the scene plays."""
     products = [path for _, _, path in products_of(job, layout, frame) if volumes or not path.endswith(".vdb")]
-    return [*products, *(layout.whitewater(fluid, frame) for fluid in job.whitewater)]
+    return [*products, *points_of(job, layout, frame)]
 
 
 def _wet(objects: Iterable[SceneObject]) -> list[str]:

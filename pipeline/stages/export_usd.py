@@ -9,7 +9,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
 from pipeline.kinds.base import Kind
-from pipeline.kinds.table import bodies, drawn_bodies, material_of, products_of
+from pipeline.kinds.table import bodies, drawn_bodies, material_of, points_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, frame_of, meshes_of, motion
@@ -43,7 +43,7 @@ class UsdExport(ExportStage):
         tasks = []
         for frame in self.chosen(job):
             products = [path for _, _, path in products_of(job, layout, frame) if not path.startswith("volumes/")]
-            points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+            points = points_of(job, layout, frame)
             tasks.append(
                 Task(
                     id=TaskId(f"{self.name}/{frame:06d}"),

@@ -1,6 +1,7 @@
 """The stages that make one file of each body of a kind and frame: surfaces, cloths, volumes."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
@@ -13,7 +14,7 @@ from pipeline.store.cache import read_compact
 
 
 class ProductStage(Stage):
-    """One file a body and frame, each from that frame of the cache alone."""
+    """One file a body and frame, each from that frame of the cache, and of what the product reads beside it."""
 
     def __init__(self, kind: Kind, product: Product) -> None:
         self.name, self.about, self.version = product.stage, product.about, product.version
@@ -32,7 +33,7 @@ class ProductStage(Stage):
             Task(
                 id=TaskId(f"{self.name}/{body.name}/{frame:06d}"),
                 stage=self.name,
-                inputs=(layout.frame_cache(frame),),
+                inputs=(layout.frame_cache(frame), *product.also_reads(body.name, frame)),
                 outputs=(layout.product(product.folder, body.name, frame, product.suffix),),
                 parameters=parameters,
                 subject=body.name,
@@ -62,6 +63,11 @@ class ProductStage(Stage):
         task = context.task
         cached = context.layout.path(task.inputs[0])
         body = read_compact(cached, task.subject)
+        for further in task.inputs[1:]:
+            found = read_compact(context.layout.path(further), task.subject)
+            body = replace(
+                body, arrays={**body.arrays, **found.arrays}, attributes={**body.attributes, **found.attributes}
+            )
         with context.committing(task.outputs[0], self._product.validate) as path:
             try:
                 self._product.write(path, body, context.job, context.threads)

@@ -13,7 +13,7 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.job.input_files import split_blend
 from pipeline.kinds.base import Work
-from pipeline.kinds.table import KINDS, material_of, products_of
+from pipeline.kinds.table import KINDS, material_of, points_of, products_of
 from pipeline.model.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, parts_of
@@ -282,7 +282,7 @@ def _without_coordinates(job: Job, layout: JobLayout) -> Iterator[tuple[str, str
 
 def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:
     products = [path for _, _, path in products_of(job, layout, frame)]
-    points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+    points = points_of(job, layout, frame)
     # The cache changes with every change of the simulation, so it is an input only where something of it is drawn.
     cached = [layout.frame_cache(frame)] if job.moving_bodies or not products else []
     return products + points + cached

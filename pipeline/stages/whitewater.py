@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from math import ceil
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
@@ -18,16 +15,10 @@ from pipeline.kinds.fluid import FLUID
 from pipeline.model.job import Job
 from pipeline.stages.base import FILE_S, FileWork, Stage, TaskContext
 from pipeline.stages.inputs import by_content
-from pipeline.store.cache import read_frame
+from pipeline.stages.obstacles import moving_obstacles, read_fluids_and_bodies
 from render.point_clouds import PointCloud, read_point_cloud, validate_point_cloud, write_point_cloud
 from sim.core.runtime import initialize
-from sim.core.snapshots import Snapshot
-from sim.shapes.parameters import Placement
 from sim.whitewater.cloud import WhitewaterCloud
-
-if TYPE_CHECKING:
-    from sim.shapes.level_set import LevelSet
-    from sim.whitewater.obstacles import MovingObstacle
 
 CORES = 2  # threads of the neighbour sums; the rest of a frame is numpy's, which takes one
 
@@ -122,7 +113,7 @@ def _next_cloud(context: TaskContext) -> tuple[WhitewaterCloud, int]:
     from sim.whitewater.motion import FluidState
     from sim.whitewater.solver import WhitewaterSolver
 
-    before, now = (_fluids_and_bodies(context.layout.path(cached)) for cached in task.inputs[:2])
+    before, now = (read_fluids_and_bodies(context.layout.path(cached)) for cached in task.inputs[:2])
     last = read_point_cloud(context.layout.path(task.inputs[2]))
     particle_radius = now[task.subject].number("particle_radius")
     solver = WhitewaterSolver(
@@ -134,38 +125,10 @@ def _next_cloud(context: TaskContext) -> tuple[WhitewaterCloud, int]:
         FluidState.of_snapshots([now[fluid.name] for fluid in job.fluid]),
         frame=task.frame,
         particle_radius=particle_radius,
-        bodies=_bodies(job, before, now, particle_radius),
+        bodies=moving_obstacles(job, before, now, particle_radius),
         sources=FluidState.of_snapshots([now[task.subject]]).particle_id if len(job.fluid) > 1 else None,
     )
     print(f"{len(cloud)} particles, {report.generated} of them new, in {report.substeps} substeps", flush=True)
     if report.not_generated:
         print(f"{report.not_generated} particles had no room below max_particles", flush=True)
     return cloud, report.not_generated
-
-
-def _fluids_and_bodies(path: Path) -> dict[str, Snapshot]:
-    """What whitewater reads of a cached frame; smoke would take longer than all of it."""
-    return {**read_frame(path, kind="rigid").bodies, **read_frame(path, kind="fluid").bodies}
-
-
-def _bodies(
-    job: Job, before: Mapping[str, Snapshot], now: Mapping[str, Snapshot], particle_radius: float
-) -> list[MovingObstacle]:
-    from sim.whitewater.obstacles import MovingObstacle, Pose
-
-    return [
-        MovingObstacle(
-            _level_set(Placement(shape=body.shape, scale=body.scale).model_dump_json(), particle_radius),
-            Pose.of_snapshot(before[body.name]),
-            Pose.of_snapshot(now[body.name]),
-        )
-        for body in job.rigid
-    ]
-
-
-@cache
-def _level_set(placement: str, particle_radius: float) -> LevelSet:
-    """Distances of a shape, its placement given as JSON; kept, as sampling a mesh takes longer than a frame."""
-    from sim.whitewater.obstacles import sample_at_rest
-
-    return sample_at_rest(Placement.model_validate_json(placement), particle_radius)

@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, Vectors, on_device
+from sim.core.arrays import Floats, Integers, Matrices, Vectors, on_device
 from sim.core.bundles import bundle
 from sim.core.cells import CellGrid, CellSort, Grid, cell_of_point, row_of_cell
 from sim.core.launch import kernel
@@ -28,6 +28,14 @@ SURFACE_ASYMMETRY = 0.25
 0 in the bulk, 0.53 on the flat face of a lattice, 0.2 in the layer below, up to 1 beyond."""
 
 CREST_DIRECTION = 0.6  # least cosine between velocity and normal on a crest (eq. 6): waves move against their surface
+
+
+class Neighborhoods(NamedTuple):
+    """What is around the particles of a fluid."""
+
+    neighbors: NDArray[np.int32]  # within h, (n,)
+    covariance: NDArray[np.float32]  # weighted covariance of their places [m²], (n, 3, 3)
+    touches_crowd: NDArray[np.bool_]  # whether a crowded particle is linked to it, (n,); True for those themselves
 
 
 class FluidField:
@@ -77,6 +85,24 @@ class FluidField:
         compute_potentials(self._fluid, normal, min_speed, _FULL_WEIGHT, _FULL_SURFACE_WEIGHT, air, crest)
         trapped_air[self._order], wave_crest[self._order] = air.to_numpy(), crest.to_numpy()
         return trapped_air, wave_crest
+
+    def neighborhoods(self, crowd: int, link: float) -> Neighborhoods:
+        """What is around every particle, in the order of `update`.
+
+        One with `crowd` neighbours or more is crowded; whether such a one is within `link` [m] of the others is told,
+        too. See `compute_neighborhoods`.
+        """
+        count = len(self._order)
+        result = Neighborhoods(np.zeros(count, np.int32), np.zeros((count, 3, 3), np.float32), np.zeros(count, bool))
+        if self._fluid is None:
+            return result
+        neighbors, covariance = ti.ndarray(ti.i32, count), ti.Matrix.ndarray(3, 3, ti.f32, count)
+        touches = ti.ndarray(ti.i32, count)
+        compute_neighborhoods(self._fluid, neighbors, covariance)
+        find_crowds(self._fluid, neighbors, crowd, link, touches)
+        result.neighbors[self._order], result.covariance[self._order] = neighbors.to_numpy(), covariance.to_numpy()
+        result.touches_crowd[self._order] = touches.to_numpy() != 0
+        return result
 
     def sample(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Velocity of the fluid at points (n, 3) [m/s], (n, 3), and the number of its particles within h, (n,)."""
@@ -172,6 +198,57 @@ def compute_potentials(
                                 curvature += (1.0 - n_i.dot(n_j)) * W_ij
         trapped_air[i] = 0.5 * closing / full_weight
         wave_crest[i] = curvature / full_surface_weight
+
+
+@kernel
+def compute_neighborhoods(fluid: Fluid, neighbors: Integers, covariance: Matrices):
+    """Number of particles within h of each, and the weighted covariance of their places, the particle's own included.
+
+    C_i = sum_j w_ij (x_j - x~)(x_j - x~)^T / sum_j w_ij about the weighted mean x~, w_ij = 1 - (|x_ij|/h)³ (Yu & Turk
+    2013, eq. 9 to 11).
+    """
+    for i in range(fluid.count):
+        x_i = fluid.x[i]
+        cell = cell_of_point(x_i, fluid.grid)
+        near = 0
+        weight = 0.0
+        first = ti.math.vec3(0.0)
+        second = ti.math.mat3(0.0)
+        for dz in range(-1, 2):
+            for dy in range(-1, 2):
+                row = row_of_cell(cell, dy, dz, fluid.grid)
+                for j in range(fluid.cell_start[row - 1], fluid.cell_start[row + 2]):
+                    x_ji = fluid.x[j] - x_i
+                    r_squared = x_ji.norm_sqr()
+                    if r_squared < fluid.h * fluid.h:
+                        q = ti.sqrt(r_squared) / fluid.h
+                        w = 1.0 - q * q * q
+                        near += 1
+                        weight += w
+                        first += w * x_ji
+                        second += w * x_ji.outer_product(x_ji)
+        mean = first / weight
+        neighbors[i] = near - 1
+        covariance[i] = second / weight - mean.outer_product(mean)
+
+
+@kernel
+def find_crowds(fluid: Fluid, neighbors: Integers, crowd: ti.i32, link: ti.f32, touches: Integers):
+    """1 for particles that have `crowd` neighbours or more, or such a particle within `link` [m]; 0 for the others."""
+    for i in range(fluid.count):
+        x_i = fluid.x[i]
+        found = 0
+        if neighbors[i] >= crowd:
+            found = 1
+        else:
+            cell = cell_of_point(x_i, fluid.grid)
+            for dz in range(-1, 2):
+                for dy in range(-1, 2):
+                    row = row_of_cell(cell, dy, dz, fluid.grid)
+                    for j in range(fluid.cell_start[row - 1], fluid.cell_start[row + 2]):
+                        if neighbors[j] >= crowd and (fluid.x[j] - x_i).norm_sqr() <= link * link:
+                            found = 1
+        touches[i] = found
 
 
 @kernel

@@ -105,7 +105,7 @@ def test_a_linear_velocity_is_carried_to_within_two_particle_radii():
 
 
 def test_a_single_particle_is_a_small_round_drop():
-    mesh = mesh_of(np.array([[0.2, -0.1, 0.3]], np.float32), parameters=SurfaceParameters(droplet_size=1.0))
+    mesh = mesh_of(np.array([[0.2, -0.1, 0.3]], np.float32))
     assert is_closed_manifold(mesh)
     distance = np.linalg.norm(mesh.vertices - [0.2, -0.1, 0.3], axis=1)
     # As large as a particle and round to half a cell of 0.75 r.

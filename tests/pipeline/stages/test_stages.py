@@ -273,17 +273,13 @@ def test_many_cores_do_not_draw_more_than_the_memory_holds(resolution):
     assert scheduler.free.memory_bytes < started[0].task.resources.memory_bytes  # and no fewer than it holds
 
 
-def test_surfaces_with_droplets_as_they_are_are_those_of_earlier_versions():
-    def document(**keys) -> dict:
-        return parameters_of(job(surface=keys), "surface")
-
-    former = document(droplet_size=1.0)
-    assert set(former["surface"]) == {
+def test_how_finely_spray_is_drawn_concerns_no_surface_by_itself():
+    """What it changes of a surface reaches that through the kinds of particles and the volume of drops."""
+    assert set(parameters_of(job(), "surface")["surface"]) == {
         *("smoothing_length_in_radii", "cube_size_in_radii", "threshold"),
         *("mesh_smoothing_iterations", "normals_smoothing_iterations"),
     }
-    assert set(former["tools"]) == {"pysplashsurf"}
-    assert document(droplet_size=0.5) == document() != former
+    assert concerned(job(), job(surface={"drops_per_particle": 10})) == {"spray"}
 
 
 def test_surfaces_and_volumes_are_counted_in_memory_too():
