@@ -24,6 +24,10 @@ MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
 """Diffuse reflectance of whole milk for red, green and blue light [-] (Jensen et al. 2001, fig. 5)."""
 
 
+DROPS_GO_FORWARD = 0.85
+"""Share of the light through a drop that keeps its direction [-]."""
+
+
 def new_material(name: str, look: str, context: LookContext) -> Any:
     """A Blender material with a look, for the body of a name."""
     material = bpy.data.materials.new(name)
@@ -159,6 +163,20 @@ def _spray(builder: NodeBuilder, context: LookContext) -> None:
     fresnel = builder.node("ShaderNodeFresnel", IOR=REFRACTIVE_INDEX["water"])
     droplet = builder.mix_shaders(fresnel.outputs[0], white, glint)
     builder.surface(builder.mix_shaders(0.45, droplet, builder.node("ShaderNodeBsdfTransparent")))
+
+
+@draws("drops")
+def _drops(builder: NodeBuilder, context: LookContext) -> None:
+    """Drops of a clear liquid that a picture does not resolve: mirrors by Fresnel's law, and what enters goes forward.
+
+    A ball of water turns light by so little that all but 15 % of it goes on as if it were not there (asymmetry 0.85 in
+    geometric optics, Bohren & Huffman 1983); that share is scattered. Points are hit on their front only.
+    """
+    scattered = _scattering(builder, or_default(context.color, (0.97, 0.985, 1.0)))
+    inner = builder.mix_shaders(DROPS_GO_FORWARD, scattered, builder.node("ShaderNodeBsdfTransparent"))
+    mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.05))
+    fresnel = builder.node("ShaderNodeFresnel", IOR=WATER_IOR)
+    builder.surface(builder.mix_shaders(fresnel.outputs[0], inner, mirror))
 
 
 @draws("foam")

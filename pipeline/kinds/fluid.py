@@ -18,7 +18,7 @@ from pipeline.kinds.live_parameters import FLUID_LIVE
 from pipeline.kinds.sizes import size_of_liquid
 from pipeline.kinds.work import fluid_work, mean_particles, surface_work
 from pipeline.model.job import Job
-from pipeline.model.looks import BODY, WHITEWATER
+from pipeline.model.looks import BODY, POINTS, WHITEWATER
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_particles
@@ -86,7 +86,7 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
         name=f"{fluid.name}.drops",
         file=f"drops/{fluid.name}/{{frame}}.ply",
         kind="spray",
-        material=material_of("spray") if sees else material,
+        material=material_of("drops") if sees else material,
     )
     for kind in WHITEWATER if fluid.name in job.whitewater else ():
         yield PointSequenceObject(
@@ -180,7 +180,7 @@ FLUID = Kind(
     compiling_s=4.0,
     drawing=1.0,
     wears="fluid",
-    material=lambda _fluid: {BODY: MaterialParameters(look="water"), **WHITEWATER},
+    material=lambda _fluid: {BODY: MaterialParameters(look="water"), **POINTS},
     look_size=size_of_liquid,
     placements=_placements,
     check=_check,

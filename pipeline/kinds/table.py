@@ -25,7 +25,7 @@ from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.smoke import SMOKE
 from pipeline.model.boxes import domain_box
 from pipeline.model.job import Job
-from pipeline.model.looks import BODY, SOLID, WHITEWATER
+from pipeline.model.looks import BODY, POINTS, SOLID
 from pipeline.model.positions import KeyPath
 from render.camera_path import corners_of_boxes
 from render.parameters import MaterialParameters
@@ -181,7 +181,7 @@ def material_of(job: Job, body: str, part: str = BODY) -> MaterialParameters:
 def described_material(job: Job, body: str, part: str = BODY) -> MaterialParameters:
     """The same with every key that the job file gives, also those that have no effect."""
     usual = _usual_material(job, body, part)
-    if part != BODY and part not in WHITEWATER:
+    if part != BODY and part not in POINTS:
         of_body = described_material(job, body)
         usual = usual if of_body.look and LOOK_TABLE[of_body.look].paints_parts else of_body
     name = body if part == BODY else f"{body}.{part}"
@@ -199,7 +199,7 @@ def is_meant(written: str, name: str) -> bool:
 
 def _usual_material(job: Job, name: str, part: str) -> MaterialParameters:
     """Material of a part of a body that the job file does not describe."""
-    if part in WHITEWATER:
-        return WHITEWATER[part]
+    if part in POINTS:
+        return POINTS[part]
     found = next((kind.material(body) for _, kind, body in bodies(job) if body.name == name), {BODY: SOLID})
     return found.get(part, found[BODY])

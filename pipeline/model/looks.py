@@ -25,6 +25,9 @@ NATURAL_MATERIALS: dict[str, dict[str, MaterialParameters]] = {
 WHITEWATER = {part: MaterialParameters(look=part) for part in ("spray", "foam", "bubbles")}
 """Materials of the parts of a fluid that has whitewater; each is a look of its own."""
 
+POINTS = {"drops": MaterialParameters(look="drops"), **WHITEWATER}
+"""Materials of all parts of a clear fluid that are drawn as points."""
+
 SOLID = MaterialParameters(look="plastic")
 
 

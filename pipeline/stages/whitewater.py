@@ -40,7 +40,7 @@ class WhitewaterStage(Stage):
 
     name = "whitewater"
     about = "spray, foam and bubbles"
-    version = 3
+    version = 4
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame of each fluid that has whitewater."""
@@ -117,7 +117,11 @@ def _next_cloud(context: TaskContext) -> tuple[WhitewaterCloud, int]:
     last = read_point_cloud(context.layout.path(task.inputs[2]))
     particle_radius = now[task.subject].number("particle_radius")
     solver = WhitewaterSolver(
-        job.whitewater[task.subject], domain=job.domain, gravity=job.gravity, frames_per_second=job.fps
+        job.whitewater[task.subject],
+        domain=job.domain,
+        gravity=job.gravity,
+        frames_per_second=job.fps,
+        rest_density=now[task.subject].number("rest_density"),
     )
     cloud, report = solver.advance_frame(
         WhitewaterCloud(last.position, last.velocity, last.radius, last.lifetime, last.kind),

@@ -16,13 +16,11 @@ from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from sim.core.hashed_numbers import uniforms
+from sim.whitewater.air_drag import SURFACE_TENSION
 from sim.whitewater.liquid import LiquidKind, LiquidState
 from sim.whitewater.motion import FluidState
 
 GAMMA_ORDER = 4.0
-
-SURFACE_TENSION = 0.072
-"""Of water [N/m]; other liquids' are a third of it to equal."""
 
 STIFF = 0.1
 """Ohnesorge number nu rho / sqrt(rho sigma d) above which viscosity keeps a drop of diameter d from breaking up

@@ -57,6 +57,10 @@ class WhitewaterParameters(Parameters):
     bubble_neighbors: Annotated[int, Field(ge=1)] = Field(
         default=20, description="With more fluid particles around it than this, out of some 33, it is a bubble [-]."
     )
+    air_density: NonNegative = Field(
+        default=1.2,
+        description="Density of the still air that slows spray down, fine drops the most [kg/m³]; 0 for a vacuum.",
+    )
     bubble_buoyancy: NonNegative = Field(
         default=2.0, description="Upward acceleration of a bubble, as a multiple of gravity [-]."
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Vector3
+from sim.whitewater.air_drag import drag_rate
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.fluid_field import FluidField
 from sim.whitewater.generation import generate, generation_rate
@@ -39,9 +40,17 @@ class WhitewaterSolver:
     """
 
     def __init__(
-        self, parameters: WhitewaterParameters, *, domain: DomainParameters, gravity: Vector3, frames_per_second: float
+        self,
+        parameters: WhitewaterParameters,
+        *,
+        domain: DomainParameters,
+        gravity: Vector3,
+        frames_per_second: float,
+        rest_density: float = 1000.0,
     ) -> None:
+        """`rest_density` is that of the fluid that the whitewater is made of [kg/m³]."""
         self._parameters, self._domain = parameters, domain
+        self._rest_density = rest_density
         self._gravity = np.asarray(gravity, np.float64)
         self._frame_dt = 1.0 / frames_per_second
 
@@ -96,7 +105,13 @@ class WhitewaterSolver:
         ahead = position + dt * velocity
         flow, neighbors = field.sample(ahead.astype(np.float32))
         kind = self._classify(neighbors, obstacles.free_share(ahead, field.support_radius, share))
-        moved, velocity = self._advect(position, velocity, flow.astype(np.float64), cloud.kind, kind, dt)
+        drag = drag_rate(
+            velocity,
+            cloud.radius.astype(np.float64),
+            air_density=self._parameters.air_density,
+            rest_density=self._rest_density,
+        )
+        moved, velocity = self._advect(position, velocity, flow.astype(np.float64), drag, cloud.kind, kind, dt)
         moved, velocity, touched, stays = obstacles.collide(moved, velocity, share)
         # Bubbles live on until they surface, and spray while it flies; spray that lies on a solid dries up.
         ages = (kind == WhitewaterKind.FOAM) | ((kind == WhitewaterKind.SPRAY) & touched)
@@ -123,20 +138,23 @@ class WhitewaterSolver:
         position: Float64Array,
         velocity: Float64Array,
         flow: Float64Array,
+        drag: Float64Array,
         kind_before: NDArray[np.uint8],
         kind: NDArray[np.uint8],
         dt: float,
     ) -> tuple[Float64Array, Float64Array]:
         """Spray flies, foam goes with the fluid, bubbles rise; each exactly where the fluid's velocity is constant.
 
+        Spray: dv/dt = g - k v, the rate k of its drag taken at the beginning (`air_drag`) and v at the end, so that no
+        step is too long; exact in a vacuum.
         Foam: x += dt (v + v~)/2 with v the fluid's velocity where the particle came from, so it turns with a vortex
         instead of spiralling out (Heun's method; their eq. 11 is explicit Euler).
         Bubbles: dv/dt = -k_b g + (v~ - v)/tau (their eq. 12 with k_d = dt/tau), solved exactly for constant v~.
         """
         moved, changed = position + dt * velocity, velocity.copy()
         spray, foam, bubble = (kind == each for each in WhitewaterKind)
-        moved[spray] += 0.5 * dt**2 * self._gravity
-        changed[spray] += dt * self._gravity
+        changed[spray] = (velocity[spray] + dt * self._gravity) / (1.0 + dt * drag[spray, None])
+        moved[spray] = position[spray] + 0.5 * dt * (velocity[spray] + changed[spray])
 
         was_carried = kind_before[foam] == WhitewaterKind.FOAM
         came_with = np.where(was_carried[:, None], velocity[foam], flow[foam])

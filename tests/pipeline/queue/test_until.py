@@ -61,8 +61,8 @@ def stages_until(*until: str) -> list[str]:
 
 def test_a_plan_holds_a_stage_and_what_it_needs():
     assert stages_until("simulate") == ["simulate"]
-    assert stages_until("surface") == ["simulate", "surface"]
-    assert stages_until("surface", "volume") == ["simulate", "surface", "volume"]
+    assert stages_until("surface") == ["simulate", "spray", "surface"]
+    assert stages_until("surface", "volume") == ["simulate", "spray", "surface", "volume"]
     assert stages_until("movie") == stages_until()
 
 

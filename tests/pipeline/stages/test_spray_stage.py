@@ -58,8 +58,8 @@ def test_a_change_concerns_only_the_stages_that_read_it(change, stages):
     assert concerned(job(), job(**change)) == stages
 
 
-@pytest.mark.parametrize(("look", "drawn"), [("water", "spray"), ("honey", "spray"), ("milk", "milk")])
-def test_drops_of_clear_liquids_are_spray_and_those_of_others_look_like_them(look, drawn):
+@pytest.mark.parametrize(("look", "drawn"), [("water", "drops"), ("honey", "drops"), ("milk", "milk")])
+def test_drops_of_clear_liquids_have_a_look_of_their_own_and_those_of_others_look_like_them(look, drawn):
     objects = {each.name: each for each in render_spec(job(material={"water": {"look": look}}), LAYOUT).objects}
     assert objects["water.drops"].material.look == drawn
     assert objects["water.drops"].file == "drops/water/{frame}.ply"

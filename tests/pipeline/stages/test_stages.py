@@ -46,6 +46,7 @@ def test_every_frame_gets_its_surface_volume_and_picture():
     assert count == {
         "bodies": 1,
         "simulate": 1,
+        "spray": 40,
         "surface": 40,
         "cloth": 0,
         "volume": 40,
@@ -62,6 +63,7 @@ def test_a_picture_waits_for_its_own_frame_and_the_film_is_cut_every_half_second
         "meshes/ball.ply",
         "surfaces/water/000007.ply",
         "volumes/plume/000007.vdb",
+        "drops/water/000007.ply",
     )
     assert [len(tasks[f"movie/segment-{index:04d}"].inputs) for index in (0, 1)] == [30, 10]
     assert tasks["movie/film"].inputs == ("movie/0000.mp4", "movie/0001.mp4")
@@ -140,7 +142,7 @@ def test_an_encoder_that_is_not_there_is_told_before_any_work(monkeypatch):
         ({"name": "other"}, set()),
         ({"render": {"device": "cpu"}}, {"render"}),
         ({"render": {"shutter": 0.25}}, {"render", "volume"}),
-        ({"fps": 30}, {"simulate", "volume", "render", "movie"}),
+        ({"fps": 30}, {"simulate", "spray", "volume", "render", "movie"}),
         ({"set": {"background": "set", "rotation_deg": 0.0}}, set()),
         ({"set": {"name": "window"}}, {"render"}),
         ({"set": {"sun_elevation_deg": 38.0}}, set()),
@@ -264,7 +266,7 @@ def test_many_cores_do_not_draw_more_than_the_memory_holds(resolution):
     """64 cores beside 8 GB: by cores alone, 32 frames would be drawn at once."""
     tasks = plan_job(job(render={"resolution": resolution}), LAYOUT, STAGES)
     capacity = Resources(cores=64, memory_bytes=8_000_000_000)
-    ready = {task.id for task in tasks if task.stage in ("bodies", "simulate", "surface", "volume")}
+    ready = {task.id for task in tasks if task.stage in ("bodies", "simulate", "spray", "surface", "volume")}
     scheduler = Scheduler(tasks, up_to_date=ready, capacity=capacity)
     started = [each for each in scheduler.start() if isinstance(each, Start)]
     worker = 450e6 + 690 * resolution[0] * resolution[1]  # as measured: 538 MB at 480 x 270, 1880 MB at 1920 x 1080

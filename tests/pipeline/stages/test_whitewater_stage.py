@@ -44,6 +44,10 @@ def job(**changes) -> Job:
     return Job.model_validate({**TANK, **changes}, strict=False)
 
 
+def points_of(of: Job) -> list[str]:
+    return [each.name for each in render_spec(of, LAYOUT).objects if each.type == "point_sequence"]
+
+
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
@@ -61,7 +65,7 @@ def test_a_frame_needs_the_one_before_and_the_fluid_at_both():
 def test_without_its_table_there_is_no_task_and_no_change_to_the_pictures():
     without = job(whitewater={})
     assert "whitewater" not in digests(without)
-    assert not [each for each in render_spec(without, LAYOUT).objects if each.type == "point_sequence"]
+    assert points_of(without) == ["water.drops"]
 
 
 @pytest.mark.parametrize(
@@ -71,7 +75,7 @@ def test_without_its_table_there_is_no_task_and_no_change_to_the_pictures():
         ({"gravity": [0, 0, -1.62]}, {"simulate", "whitewater"}),
         ({"material": {"water.foam": {"look": "foam", "color": (0.9, 0.8, 0.7)}}}, {"render"}),
         ({"surface": {"threshold": 0.5}}, {"surface"}),
-        ({"fluid": [{**TANK["fluid"][0], "viscosity": 1e-3}]}, {"simulate"}),
+        ({"fluid": [{**TANK["fluid"][0], "viscosity": 1e-3}]}, {"simulate", "spray"}),
         ({"frames": 80}, set()),
     ],
     ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else str(value),
@@ -98,8 +102,8 @@ def test_the_memory_claim_counts_the_fluids_and_the_cloud():
 
 
 def test_each_kind_is_drawn_with_a_look_of_its_own():
-    objects = {each.name: each for each in render_spec(job(), LAYOUT).objects if each.type == "point_sequence"}
-    assert list(objects) == ["water.spray", "water.foam", "water.bubbles"]
+    assert points_of(job()) == ["water.drops", "water.spray", "water.foam", "water.bubbles"]
+    objects = {each.name: each for each in render_spec(job(), LAYOUT).objects if each.name in points_of(job())[1:]}
     assert [each.material.look for each in objects.values()] == ["spray", "foam", "bubbles"]
     assert {each.file for each in objects.values()} == {"whitewater/water/{frame}.ply"}
 

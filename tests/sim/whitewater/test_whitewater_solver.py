@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from thread_counts import digest_of, result_on_any_threads
@@ -28,6 +30,7 @@ from sim.whitewater.motion import FluidMotion, FluidState
 from sim.whitewater.parameters import WhitewaterParameters
 
 DT = 1.0 / FPS
+VACUUM = WhitewaterParameters(air_density=0.0)
 
 
 def advance(cloud_now, begin, end, *, frame=1, using=None, **options):
@@ -40,17 +43,28 @@ def made(begin, end, parameters: WhitewaterParameters | None = None, *, frame=1,
     return using.advance_frame(WhitewaterCloud.empty(), begin, end, frame=frame, particle_radius=RADIUS, **options)
 
 
-def test_spray_flies_on_a_parabola(taichi_cpu):
+def test_spray_flies_on_a_parabola_in_a_vacuum(taichi_cpu):
     wide = DomainParameters(min=(-10.0, -10.0, -10.0), max=(10.0, 10.0, 10.0), open_faces=ALL_FACES)
     start, throw = np.array([0.1, -0.2, 0.3]), np.array([1.5, -0.5, 4.0])
     flying = cloud(start, throw)
     for frame in range(1, 31):
-        flying = advance(flying, NO_FLUID, NO_FLUID, frame=frame, using=solver(domain=wide))
+        flying = advance(flying, NO_FLUID, NO_FLUID, frame=frame, using=solver(VACUUM, domain=wide))
     time = 30 * DT
     assert flying.kind.tolist() == [WhitewaterKind.SPRAY]
     # Each of 30 frames rounds to float32, at most 1.2e-7 of some 2 m and, over the rest of the flight, of 4 m/s.
     np.testing.assert_allclose(flying.position[0], start + time * throw + 0.5 * time**2 * np.array(GRAVITY), atol=1e-5)
     np.testing.assert_allclose(flying.velocity[0], throw + time * np.array(GRAVITY), atol=2e-5)
+
+
+@pytest.mark.parametrize(("diameter", "speed"), [(1e-3, 4.03), (2e-3, 6.49), (3e-3, 8.06)])
+def test_drops_fall_as_fast_as_those_of_rain(taichi_cpu, diameter, speed):
+    """Terminal speeds of water drops that Gunn & Kinzer 1949 measured; the coefficients are good to some 7 %."""
+    deep = DomainParameters(min=(-1.0, -1.0, -100.0), max=(1.0, 1.0, 1.0), open_faces=ALL_FACES)
+    falling = cloud((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    falling = replace(falling, radius=np.full(1, diameter / 2.0, np.float32))
+    for frame in range(1, round(4 * FPS) + 1):
+        falling = advance(falling, NO_FLUID, NO_FLUID, frame=frame, using=solver(domain=deep))
+    assert -falling.velocity[0, 2] == pytest.approx(speed, rel=0.07)
 
 
 def test_foam_turns_with_a_vortex(taichi_cpu):
