@@ -99,7 +99,7 @@ def reconstruct_surface(
 
 
 def with_volume(
-    mesh: SurfaceMesh, volume: float, thinness: NDArray[np.floating], *, particle_radius: float
+    mesh: SurfaceMesh, volume: float, thinness: NDArray[Any], *, particle_radius: float
 ) -> SurfaceMesh:
     """Move a closed surface along its normals until it encloses a volume [m³], as far as that goes.
 

@@ -174,7 +174,8 @@ def test_a_plain_submit_continues_to_the_film_and_the_queue_keeps_the_goal_of_a_
 def test_a_stage_may_be_named_with_frames():
     job = job_of_text(SCENE, Path("job.toml"))
     tasks = plan_job(job, JobLayout(Path("renders/small")), STAGES, ("surface:1",))
-    assert [task.id for task in tasks] == ["simulate", "surface/water/000001"]
+    kinds = ["spray/water/000000", "spray/water/000001"]  # each is told from the one before
+    assert [task.id for task in tasks] == ["simulate", *kinds, "surface/water/000001"]
     with pytest.raises(PlanError, match="nothing for the stage"):
         plan_job(job, JobLayout(Path("renders/small")), STAGES, ("surface:2",))
     with pytest.raises(PlanError, match="runs backwards"):
@@ -182,6 +183,6 @@ def test_a_stage_may_be_named_with_frames():
 
 
 def test_exports_are_planned_only_where_they_are_asked_for():
-    assert stages_until("export-vtk") == ["simulate", "surface", "export-vtk"]
+    assert stages_until("export-vtk") == ["simulate", "spray", "surface", "export-vtk"]
     assert not [stage for stage in stages_until() if stage.startswith("export")]
     assert tuple(EXPORTS) == FORMATS
