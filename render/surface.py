@@ -98,9 +98,7 @@ def reconstruct_surface(
     return without_collapsed_parts(mesh)
 
 
-def with_volume(
-    mesh: SurfaceMesh, volume: float, thinness: NDArray[Any], *, particle_radius: float
-) -> SurfaceMesh:
+def with_volume(mesh: SurfaceMesh, volume: float, thinness: NDArray[Any], *, particle_radius: float) -> SurfaceMesh:
     """Move a closed surface along its normals until it encloses a volume [m³], as far as that goes.
 
     Contour and smoothing take most from what is thin or curved: sheets and threads, (n,) between 0 and 1 at the
