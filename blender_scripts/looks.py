@@ -175,7 +175,7 @@ def _drops(builder: NodeBuilder, context: LookContext) -> None:
     scattered = _scattering(builder, or_default(context.color, (0.97, 0.985, 1.0)))
     inner = builder.mix_shaders(DROPS_GO_FORWARD, scattered, builder.node("ShaderNodeBsdfTransparent"))
     mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.05))
-    fresnel = builder.node("ShaderNodeFresnel", IOR=WATER_IOR)
+    fresnel = builder.node("ShaderNodeFresnel", IOR=REFRACTIVE_INDEX["water"])
     builder.surface(builder.mix_shaders(fresnel.outputs[0], inner, mirror))
 
 

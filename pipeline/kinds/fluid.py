@@ -81,12 +81,13 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
         material=material,
         wets_within=WETS_WITHIN_RADII * fluid.particle_radius if sees else None,
     )
+    is_clear = material.look is None or LOOK_TABLE[material.look].refracts
     # Drops of a clear liquid are too small to refract in a picture; those of others look like it.
     yield PointSequenceObject(
         name=f"{fluid.name}.drops",
         file=f"drops/{fluid.name}/{{frame}}.ply",
         kind="spray",
-        material=material_of("drops") if sees else material,
+        material=material_of("drops") if is_clear else material,
     )
     for kind in WHITEWATER if fluid.name in job.whitewater else ():
         yield PointSequenceObject(
@@ -140,9 +141,9 @@ def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
         volume=len(meshed) * (2.0 * radius) ** 3 - fluid.number("volume_of_drops"),
         threads=threads,
     )
-    dye, radius = fluid.arrays.get("dye"), fluid.number("particle_radius")
+    dye = fluid.arrays.get("dye")
     if dye is not None:
-        dye = dye_at(surface.vertices, fluid.arrays["position"], dye, particle_radius=radius)
+        dye = dye_at(surface.vertices, fluid.arrays["position"][meshed], dye[meshed], particle_radius=radius)
     write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities, dye=dye)
 
 
