@@ -142,7 +142,7 @@ def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot]) -> LiquidState:
     before = LiquidState.empty()
     if task.frame:
         last = read_frame(context.layout.path(task.inputs[1]), task.subject).bodies[task.subject].arrays
-        before = LiquidState(last["particle_id"], last["liquid"], last["held"], last["reach"])
+        before = LiquidState.of_arrays(last)
     breaks_up = job.surface.drops_per_particle > 0 and atomizes(
         viscosity=said.viscosity, rest_density=said.rest_density, particle_radius=particle_radius
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle
-from sim.core.drag import drag_coefficient
+from sim.core.drag import AIR_VISCOSITY, FLAT_DRAG, FLATTENING, TENSION_OF_WATER, drag_coefficient
 from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Share
@@ -17,10 +17,7 @@ from sim.fluid.kernels import Discretization, inverse_distance, lattice_offsets
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid
 
-TENSION_OF_WATER = 0.0728  # against air at 20 degrees C (IAPWS R1-76) [N/m]
-AIR_VISCOSITY = 1.82e-5  # dynamic, at 20 degrees C [Pa s]
-FLATTENING, WIDENING = 1.0 / 12.0, 0.5  # C_F/(C_k C_b) and C_b of the TAB model (O'Rourke & Amsden 1987) [-]
-FLAT_DRAG = 2.632  # growth of C_D with the flattening (Liu, Mather & Reitz 1993, eq. 7) [-]
+WIDENING = 0.5  # C_b of the TAB model (O'Rourke & Amsden 1987): growth of the radius with the flattening [-]
 SHEET_DRAG = 1.0  # C_D of a particle of a sheet [-]
 FULL_SHARE = 2.0 / 3.0  # of a full neighbourhood, from which on a particle is part of a sheet and no drop
 COVERED = 0.85

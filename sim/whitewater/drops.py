@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
+from sim.core.drag import TENSION_OF_WATER
 from sim.core.hashed_numbers import uniforms
-from sim.whitewater.air_drag import SURFACE_TENSION
 from sim.whitewater.liquid import LiquidKind, LiquidState
 from sim.whitewater.motion import FluidState
 
@@ -58,7 +58,7 @@ def atomizes(*, viscosity: float, rest_density: float, particle_radius: float) -
     Viscosity is kinematic [m²/s], density in [kg/m³], and the radius half the particles' spacing [m].
     """
     diameter = 2.0 * particle_radius
-    return viscosity * math.sqrt(rest_density / (SURFACE_TENSION * diameter)) < STIFF
+    return viscosity * math.sqrt(rest_density / (TENSION_OF_WATER * diameter)) < STIFF
 
 
 def drops_of_particle(*, particle_radius: float, diameter: float, most: int) -> int:

@@ -8,6 +8,7 @@ that nothing flickers.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -67,6 +68,16 @@ class LiquidState:
         """No particles."""
         bytes_ = np.zeros(0, np.uint8)
         return cls(np.zeros(0, np.int32), bytes_, bytes_, np.zeros(0, np.float32))
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> LiquidState:
+        """The particles of a frame's datasets, by name."""
+        return cls(
+            arrays["particle_id"].astype(np.int32, copy=False),
+            arrays["liquid"].astype(np.uint8, copy=False),
+            arrays["held"].astype(np.uint8, copy=False),
+            arrays["reach"].astype(np.float32, copy=False),
+        )
 
 
 def next_liquid(

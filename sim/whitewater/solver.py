@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
+from sim.core.drag import drag_rate
 from sim.core.parameters import Vector3
-from sim.whitewater.air_drag import drag_rate
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.fluid_field import FluidField
 from sim.whitewater.generation import generate, generation_rate
@@ -145,7 +145,7 @@ class WhitewaterSolver:
     ) -> tuple[Float64Array, Float64Array]:
         """Spray flies, foam goes with the fluid, bubbles rise; each exactly where the fluid's velocity is constant.
 
-        Spray: dv/dt = g - k v, the rate k of its drag taken at the beginning (`air_drag`) and v at the end, so that no
+        Spray: dv/dt = g - k v, the rate k of its drag taken at the beginning (`drag_rate`) and v at the end, so that no
         step is too long; exact in a vacuum.
         Foam: x += dt (v + v~)/2 with v the fluid's velocity where the particle came from, so it turns with a vortex
         instead of spiralling out (Heun's method; their eq. 11 is explicit Euler).
