@@ -111,7 +111,7 @@ def with_volume(mesh: SurfaceMesh, volume: float, thinness: NDArray[Any], *, par
     corners, directions = mesh.vertices.astype(np.float64), np.nan_to_num(mesh.normals.astype(np.float64))
     largest = LARGEST_SHIFT_IN_RADII * particle_radius
     shift = np.zeros(len(corners))
-    for weights in (np.clip(thinness, 0.0, 1.0).astype(np.float64), np.ones(len(corners))):
+    for weights in (np.clip(np.nan_to_num(thinness), 0.0, 1.0).astype(np.float64), np.ones(len(corners))):
         for _ in range(_ROUNDS):
             moved = corners + shift[:, None] * directions
             areas = _area_vectors(moved, mesh.faces)

@@ -30,6 +30,7 @@ from sim.fluid.parameters import FluidParameters
 if TYPE_CHECKING:
     from sim.whitewater.drops import Drops
     from sim.whitewater.liquid import LiquidState
+    from sim.whitewater.obstacles import Obstacles
 
 CORES = 2  # as whitewater, which a process may make, too: its Taichi keeps its number of threads
 
@@ -89,12 +90,13 @@ class SprayStage(Stage):
         from sim.whitewater.liquid import LiquidKind
 
         bodies = read_fluids_and_bodies(layout.path(task.inputs[0]))
-        state = _kinds(context, bodies)
-        drops = _drops(job, bodies, task.subject, state)
+        solids = _solids(job, bodies, bodies[task.subject].number("particle_radius"))
+        state = _kinds(context, bodies, solids)
+        drops, gone = _drops(job, bodies, task.subject, state, solids)
         kinds = Snapshot(
             "fluid",
             {"particle_id": state.particle_id, "liquid": state.kind, "held": state.held, "reach": state.reach},
-            {"volume_of_drops": drops.volume},
+            {"volume_of_drops": drops.volume + gone},
         )
         with ExitStack() as stack:
             to_kinds = stack.enter_context(context.committing(task.outputs[0], validate_frame))
@@ -129,10 +131,17 @@ def _inputs(layout: JobLayout, fluid: str, frame: int) -> tuple[ArtifactPath, ..
     return (layout.frame_cache(frame), *((layout.liquid(fluid, frame - 1),) if frame else ()))
 
 
-def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot]) -> LiquidState:
+def _solids(job: Job, bodies: Mapping[str, Snapshot], particle_radius: float) -> Obstacles:
+    """Walls and bodies where they are in a frame, as finely as fluid of this particle radius [m] can tell."""
+    from sim.whitewater.obstacles import Obstacles
+
+    return Obstacles(job.domain, moving_obstacles(job, bodies, bodies, particle_radius), 1.0 / job.fps)
+
+
+def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot], solids: Obstacles) -> LiquidState:
     """The kinds of the task's fluid, from those of the frame before."""
     from sim.whitewater.drops import atomizes, spread
-    from sim.whitewater.liquid import LiquidState, next_liquid
+    from sim.whitewater.liquid import LiquidState, lie_on, next_liquid
     from sim.whitewater.motion import FluidState
 
     task, job = context.task, context.job
@@ -153,16 +162,18 @@ def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot]) -> LiquidState:
         particle_radius=particle_radius,
         frame_dt=1.0 / job.fps,
         atomizes=breaks_up,
+        lies=lie_on(solids, fluid, particle_radius=particle_radius, frame_dt=1.0 / job.fps),
     )
     return spread(state, fluid, particle_radius=particle_radius, dt=1.0 / job.fps)
 
 
-def _drops(job: Job, bodies: Mapping[str, Snapshot], name: str, state: LiquidState) -> Drops:
-    """The drops of a fluid's spray that are neither in the liquid nor in walls and bodies."""
+def _drops(
+    job: Job, bodies: Mapping[str, Snapshot], name: str, state: LiquidState, solids: Obstacles
+) -> tuple[Drops, float]:
+    """The drops of a fluid's spray that are neither in the liquid nor in walls and bodies; what has left [m³]."""
     from sim.whitewater.drops import Drops, drops_of, drops_of_particle, in_the_air
     from sim.whitewater.liquid import LiquidKind
     from sim.whitewater.motion import FluidState
-    from sim.whitewater.obstacles import Obstacles
 
     fluid, particle_radius = FluidState.of_snapshots([bodies[name]]), bodies[name].number("particle_radius")
     count = drops_of_particle(
@@ -170,11 +181,14 @@ def _drops(job: Job, bodies: Mapping[str, Snapshot], name: str, state: LiquidSta
     )
     drops = drops_of(state, fluid, particle_radius=particle_radius, count=count)
     if not len(drops.radius):
-        return drops
-    obstacles = Obstacles(job.domain, moving_obstacles(job, bodies, bodies, particle_radius), 1.0 / job.fps)
-    position, velocity, _, stays = obstacles.collide(drops.position, drops.velocity, 1.0)
-    outside = Drops(position, velocity, drops.radius).kept(stays)
-    return in_the_air(outside, fluid.position[state.kind != LiquidKind.SPRAY], particle_radius=particle_radius)
+        return drops, 0.0
+    position, velocity, _, stays = solids.collide(drops.position, drops.velocity, 1.0)
+    drops = Drops(position, velocity, drops.radius)
+    has_left = ((position < job.domain.min) | (position > job.domain.max)).any(axis=1) & ~stays
+    in_air = in_the_air(
+        drops.kept(stays), fluid.position[state.kind != LiquidKind.SPRAY], particle_radius=particle_radius
+    )
+    return in_air, drops.kept(has_left).volume
 
 
 def _points(drops: Drops) -> PointCloud:

@@ -17,7 +17,6 @@ from sim.fluid.kernels import Discretization, inverse_distance, lattice_offsets
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid
 
-WIDENING = 0.5  # C_b of the TAB model (O'Rourke & Amsden 1987): growth of the radius with the flattening [-]
 SHEET_DRAG = 1.0  # C_D of a particle of a sheet [-]
 FULL_SHARE = 2.0 / 3.0  # of a full neighbourhood, from which on a particle is part of a sheet and no drop
 COVERED = 0.85
@@ -44,14 +43,14 @@ class AirDrag:
 
     With s the number of neighbours over 2/3 of those in a filled lattice, at most 1:
 
-        C_i = (1 - s) C_D(Re) (1 + 2.632 y) + s,   A_i = omega [(1 - s) pi (L + y L/2)² + s d²]
+        C_i = (1 - s) C_D(Re) (1 + 2.632 y) + s,   A_i = omega [(1 - s) pi L² + s d²]
 
     y = We/12, at most 1, is the flattening of a drop of radius L in a steady stream, We = rho_a |v|² L/sigma, and
     omega = 1 - max_j v.(x_i - x_j)/(|v||x_ij|)/0.85, at least 0, what other particles or walls leave free.
 
-    Other than in the paper, Re is by the diameter, as the law of the sphere has it, y is that of a steady stream, and
-    omega is 0 from a cosine of 0.85 on: within a filled lattice no air acts. The drag is that of the velocity after
-    the step, as far as other forces are known before it, so that no step is too long for it.
+    Other than in the paper, Re is by the diameter, as the law of the sphere has it, A that of the sphere, y that of a
+    steady stream, and omega is 0 from a cosine of 0.85 on: within a filled lattice no air acts. The drag is that of
+    the velocity after the step, as far as other forces are known before it, so that no step is too long for it.
     """
 
     def __init__(self, fluids: tuple[FluidParameters, ...], discretization: Discretization) -> None:
@@ -129,9 +128,8 @@ def add_air_drag(fluid: Fluid, air: Air, dt: ti.f32, acceleration: Vectors, shar
                 flat = ti.min(air.flattening[own] * speed * speed, 1.0)
                 reynolds = 2.0 * air.radius * air.density * speed / AIR_VISCOSITY
                 drop = drag_coefficient(reynolds) * (1.0 + FLAT_DRAG * flat)
-                across = air.radius * (1.0 + WIDENING * flat)
                 coefficient = (1.0 - sheet) * drop + sheet * SHEET_DRAG
-                area = (1.0 - sheet) * ti.math.pi * across * across + sheet * air.spacing * air.spacing
+                area = (1.0 - sheet) * ti.math.pi * air.radius * air.radius + sheet * air.spacing * air.spacing
                 area *= ti.max(1.0 - covered / COVERED, 0.0)
                 mass = fluid.materials.rest_density[own] * fluid.volume
                 rate = 0.5 * air.density * speed * coefficient * area / mass

@@ -9,7 +9,7 @@ that nothing flickers.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from sim.whitewater.fluid_field import SUPPORT_IN_SPACINGS, FluidField
 from sim.whitewater.motion import FluidState
+from sim.whitewater.obstacles import Obstacles
 
 CROWDED = 16
 """Neighbours from which a particle is inside of the liquid or on its surface: a lattice has 32 within h, its flat face
@@ -88,6 +89,7 @@ def next_liquid(
     particle_radius: float,
     frame_dt: float,
     atomizes: bool,
+    lies: NDArray[np.bool_],
 ) -> LiquidState:
     """The kinds of a fluid's particles at a frame; `sim.core.runtime.initialize` must have run.
 
@@ -100,12 +102,11 @@ def next_liquid(
         particle_radius: [m], half the spacing of the particles at rest.
         frame_dt: time between frames [s].
         atomizes: whether pieces break up; a liquid too stiff for it has no spray.
+        lies: which particles walls and bodies hold, (n,): what is left on a floor is no spray.
     """
     spacing = 2.0 * particle_radius
     rows = np.searchsorted(tank.particle_id, particle_id)
     neighbors, flatness, piece = (each[rows] for each in _surroundings(tank, spacing))
-    flown = replace(tank, position=tank.position + np.float32(KEPT_FRAMES * frame_dt) * tank.velocity)
-    falls_in = _field(flown, spacing).neighborhoods(CROWDED, 0.0).neighbors[rows] >= CROWDED
 
     kind, held, reach = (np.zeros(len(particle_id), dtype) for dtype in (np.uint8, np.uint8, np.float32))
     is_new = np.ones(len(particle_id), bool)
@@ -116,9 +117,11 @@ def next_liquid(
     small = piece < np.where(was_spray, STAYING_SPRAY_PIECE, SPRAY_PIECE)
     lonely = neighbors <= np.where(was_spray, STAYING_LONELY, LONELY)
     flat = (flatness < np.where(was_sheet, STAYING_FLAT, FLAT)) & (neighbors < CROWDED)
-    breaks_up = atomizes & (small | lonely) & (was_spray | ~falls_in)
+    breaks_up = atomizes & (small | lonely) & ~lies
+    new = np.flatnonzero(breaks_up & ~was_spray)
+    breaks_up[new] = ~_falls_in(tank, rows[new], KEPT_FRAMES * frame_dt, spacing)
     wanted = np.where(breaks_up, LiquidKind.SPRAY, np.where(flat, LiquidKind.SHEET, LiquidKind.BULK))
-    swallowed = was_spray & (neighbors >= CROWDED)
+    swallowed = was_spray & ((neighbors >= CROWDED) | lies)
     changes = (wanted != kind) & (is_new | swallowed | (held >= KEPT_FRAMES))
     kind = np.where(changes, wanted, kind).astype(np.uint8)
     # What is there from the start has been what it is for long.
@@ -148,6 +151,25 @@ def _surroundings(tank: FluidState, spacing: float) -> tuple[NDArray[np.int32], 
     size[np.bincount(label, around.touches_crowd[thin], minlength=pieces) > 0] = count
     piece[thin] = size[label]
     return around.neighbors, flatness, piece
+
+
+def _falls_in(tank: FluidState, rows: NDArray[np.intp], ahead_s: float, spacing: float) -> NDArray[np.bool_]:
+    """Which of these particles are in the crowd if all fly on as they do for some time [s]."""
+    if not len(rows):
+        return np.zeros(0, bool)
+    flown = tank.position.astype(np.float64) + ahead_s * tank.velocity
+    counts = cKDTree(flown).query_ball_point(flown[rows], SUPPORT_IN_SPACINGS * spacing, return_length=True)
+    found: NDArray[np.bool_] = counts - 1 >= CROWDED  # they count themselves
+    return found
+
+
+def lie_on(solids: Obstacles, fluid: FluidState, *, particle_radius: float, frame_dt: float) -> NDArray[np.bool_]:
+    """Which particles walls and bodies hold: a spacing near, and slow enough to be there as long as a kind is kept."""
+    spacing, speed = 2.0 * particle_radius, np.linalg.norm(fluid.velocity.astype(np.float64), axis=1)
+    slow = np.flatnonzero(speed * KEPT_FRAMES * frame_dt < spacing)
+    lies = np.zeros(len(fluid.position), bool)
+    lies[slow] = solids.free_share(fluid.position[slow].astype(np.float64), spacing, 1.0) < 1.0
+    return lies
 
 
 def _field(tank: FluidState, spacing: float) -> FluidField:

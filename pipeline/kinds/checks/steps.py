@@ -27,10 +27,16 @@ ARTIFICIAL_VISCOSITY_AT_IMPACTS = 0.1
 SLOWED_BY_TENSION = 4.0
 """Steps that surface tension asks for over those of the flow from which on it is worth a warning."""
 
+PARTS_OF_DYE = 8.9
+"""Parts that diffusion takes a time t in, over D t/d² (`sim.fluid.dye`, at a support of 2 d)."""
+MANY_PARTS = 200.0
+"""Such parts a frame from which on they are worth a warning: they take as long as ten steps of the flow."""
+
 
 def check_time_steps(job: Job, solids: Solids, findings: Findings) -> None:
-    """Warn of fixed steps above what will be stable, in the flow or where it hits a wall, and of stiff surfaces."""
+    """Warn of fixed steps above what will be stable, in the flow or at walls, of stiff surfaces, and of fast dye."""
     for index, fluid in enumerate(job.fluid):
+        _check_dye(job, index, findings)
         speed = expected_speed(job, solids)
         if fluid.dt == "adaptive":
             _check_tension(job, index, _dt_of_flow(job, fluid, speed), findings)
@@ -87,6 +93,18 @@ def _check_tension(job: Job, index: int, of_flow: float, findings: Findings) -> 
             ("fluid", index, "surface_tension"),
             f"asks for steps of {allowed:.2g} s, {1.0 / (job.fps * allowed):,.0f} a frame, {slower:.2g} times as many "
             f"as the flow; use {bearable:g} or less, or particle_radius {radius:g} m or more",
+        )
+
+
+def _check_dye(job: Job, index: int, findings: Findings) -> None:
+    """Warn of a dye that diffuses so fast that particles have to exchange it many times a frame."""
+    fluid = job.fluid[index]
+    parts = PARTS_OF_DYE * fluid.dye_diffusivity / (job.fps * fluid.spacing**2)
+    if fluid.has_dye and parts > MANY_PARTS:
+        bearable = rounded_down(fluid.dye_diffusivity * MANY_PARTS / parts)
+        findings.warn(
+            ("fluid", index, "dye_diffusivity"),
+            f"neighbours have to exchange dye {parts:,.0f} times a frame; use {bearable:g} m²/s or less",
         )
 
 

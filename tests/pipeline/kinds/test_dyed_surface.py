@@ -25,10 +25,14 @@ RADIUS = 0.01
 def test_a_vertex_has_the_dye_of_the_particles_around_it(is_dyed, tmp_path):
     axes = [RADIUS * (2 * np.arange(count) + 1) for count in (12, 6, 6)]
     position = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
-    arrays = {"position": position, "velocity": np.zeros_like(position)}
+    position = np.concatenate([position, [[0.02, 0.06, 0.3]]], dtype=np.float32)  # spray, of the dye of the other end
+    liquid = np.zeros(len(position), np.uint8)
+    liquid[-1] = 2
+    arrays = {"position": position, "velocity": np.zeros_like(position), "liquid": liquid}
     if is_dyed:
-        arrays["dye"] = (position[:, 0] < 0.12).astype(np.float32)
-    fluid = Snapshot(kind="fluid", arrays=arrays, attributes={"particle_radius": RADIUS, "rest_density": 1000.0})
+        arrays["dye"] = ((position[:, 0] < 0.12) & (liquid == 0)).astype(np.float32)
+    attributes = {"particle_radius": RADIUS, "rest_density": 1000.0, "volume_of_drops": (2.0 * RADIUS) ** 3}
+    fluid = Snapshot(kind="fluid", arrays=arrays, attributes=attributes)
     job = job_of_text(JOB, tmp_path / "pool.toml")
     SURFACE.write(tmp_path / "milk.ply", fluid, job, 1)
     mesh = read_ply(tmp_path / "milk.ply")

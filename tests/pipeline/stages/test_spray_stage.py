@@ -189,12 +189,24 @@ def test_without_drops_every_particle_is_of_the_surface(splash, tmp_path):
     assert read_ply(copy.path(copy.surface("water", 0))).vertices[:, 2].max() > 0.6
 
 
-def test_jets_of_two_fluids_that_meet_are_one_piece(tmp_path):
+@pytest.mark.parametrize("is_alone", [False, True])
+def test_a_piece_that_another_fluid_surrounds_is_no_spray(is_alone, tmp_path):
+    """A cube of eight particles of oil, within a jet of water or in the air above it."""
     layout = JobLayout(tmp_path / "tank")
     write_cache(layout, second_jet="oil")
     layout.job_file.write_text(JOB_FILE.replace("[whitewater", OIL + "[whitewater"))
-    printed = run_in_a_process(layout, ["spray/oil/000000", "spray/oil/000001"])
-    assert printed.count("Finished") == 2, printed
-    oil = read_frame(layout.path(layout.liquid("oil", 1)), "oil").bodies["oil"].arrays
-    cached = read_frame(layout.path(layout.frame_cache(1)), "oil").bodies["oil"].arrays
-    np.testing.assert_array_equal(oil["particle_id"], cached["particle_id"])
+    path = layout.path(layout.frame_cache(0))
+    bodies = read_frame(path).bodies
+    water = bodies["water"].arrays
+    middle = np.median(water["position"], axis=0)
+    few = np.zeros(len(water["position"]), bool)
+    few[np.argsort(np.linalg.norm(water["position"] - middle, axis=1), kind="stable")[:8]] = True
+    oil = {key: array[few].copy() for key, array in water.items()}
+    oil["position"] += np.float32([0.0, 0.0, 0.3 * is_alone])
+    water = {key: array[~few] for key, array in water.items()}
+    for name, arrays in (("water", water), ("oil", oil)):
+        bodies[name] = Snapshot("fluid", arrays, bodies[name].attributes)
+    write_frame(path, bodies, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
+    assert run_in_a_process(layout, ["spray/oil/000000"]).count("Finished") == 1
+    kinds = read_frame(layout.path(layout.liquid("oil", 0)), "oil").bodies["oil"].arrays["liquid"]
+    assert (kinds == 2).tolist() == [is_alone] * 8

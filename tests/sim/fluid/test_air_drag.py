@@ -21,7 +21,7 @@ def drag_of_drop(speed: float, radius: float) -> float:
     reynolds = 2.0 * radius * AIR * speed / AIR_VISCOSITY
     sphere = 0.424 if reynolds > 1000.0 else 24.0 / reynolds * (1.0 + reynolds ** (2.0 / 3.0) / 6.0)
     flat = min(AIR * speed**2 * radius / TENSION_OF_WATER / 12.0, 1.0)
-    return 0.5 * AIR * speed**2 * sphere * (1.0 + 2.632 * flat) * math.pi * (radius * (1.0 + 0.5 * flat)) ** 2
+    return 0.5 * AIR * speed**2 * sphere * (1.0 + 2.632 * flat) * math.pi * radius**2
 
 
 @pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])

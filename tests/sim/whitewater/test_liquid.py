@@ -8,18 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sim.core.runtime import initialize
-from sim.whitewater.liquid import CROWDED, KEPT_FRAMES, LiquidKind, LiquidState, next_liquid
+from sim.core.domain import DomainParameters
+from sim.whitewater.liquid import CROWDED, KEPT_FRAMES, LiquidKind, LiquidState, lie_on, next_liquid
 from sim.whitewater.motion import FluidState
+from sim.whitewater.obstacles import Obstacles
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
 RADIUS = 0.005
 D = 2.0 * RADIUS
 DT = 1.0 / 60.0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def taichi():
-    initialize("cpu", threads=1)
 
 
 def lattice(*counts: int) -> np.ndarray:
@@ -32,7 +30,9 @@ def fluid(position: np.ndarray, velocity=(0.0, 0.0, 0.0)) -> FluidState:
     return FluidState(np.arange(len(position), dtype=np.int32), position.astype(np.float32), moving)
 
 
-def kinds(state: FluidState, before: LiquidState | None = None, *, atomizes: bool = True) -> LiquidState:
+def kinds(
+    state: FluidState, before: LiquidState | None = None, *, atomizes: bool = True, lies: bool = False
+) -> LiquidState:
     return next_liquid(
         before or LiquidState.empty(),
         state,
@@ -40,6 +40,7 @@ def kinds(state: FluidState, before: LiquidState | None = None, *, atomizes: boo
         particle_radius=RADIUS,
         frame_dt=DT,
         atomizes=atomizes,
+        lies=np.full(len(state.particle_id), lies),
     )
 
 
@@ -151,3 +152,39 @@ def test_the_threshold_of_the_crowd_lies_between_a_film_and_a_face():
     offsets = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     near = offsets[(np.linalg.norm(offsets, axis=1) <= 2.0) & offsets.any(axis=1)]
     assert (near[:, 2] == 0).sum() < CROWDED <= (near[:, 2] <= 0).sum()
+
+
+def test_a_puddle_that_a_floor_holds_is_no_spray_and_one_that_flies_is():
+    puddle = fluid(lattice(3, 3, 1))
+    assert (kinds(puddle).kind == LiquidKind.SPRAY).all()
+    landed = kinds(puddle, kinds(puddle), lies=True)
+    assert (landed.kind == LiquidKind.SHEET).all()
+
+
+def test_fluid_lies_on_floors_and_bodies_where_it_is_near_and_slow():
+    solids = Obstacles(DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 1.0, 1.0)), [], DT)
+    heights, speeds = (0.5 * D, 0.5 * D, 1.5 * D, 0.3), (0.0, 2.0, 0.0, 0.0)
+    state = FluidState(
+        particle_id=np.arange(4, dtype=np.int32),
+        position=np.array([(0.5, 0.5, z) for z in heights], np.float32),
+        velocity=np.array([(v, 0.0, 0.0) for v in speeds], np.float32),
+    )
+    assert lie_on(solids, state, particle_radius=RADIUS, frame_dt=DT).tolist() == [True, False, False, False]
+
+
+def test_one_fast_particle_costs_no_grid_as_long_as_its_way():
+    """At one frame a second it would be 40 m away when its kind may change again."""
+    position = np.concatenate([lattice(6, 6, 6), [[0.5, 0.5, 0.5]]])
+    state = fluid(position)
+    state.velocity[-1] = (1000.0, 0.0, 0.0)
+    found = next_liquid(
+        LiquidState.empty(),
+        state,
+        state.particle_id,
+        particle_radius=RADIUS,
+        frame_dt=1.0,
+        atomizes=True,
+        lies=np.zeros(len(position), bool),
+    )
+    assert found.kind[-1] == LiquidKind.SPRAY
+    assert (found.kind[:-1] == LiquidKind.BULK).any()

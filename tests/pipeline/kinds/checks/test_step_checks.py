@@ -136,3 +136,18 @@ def test_a_surface_that_is_stiffer_than_the_flow_is_told_with_what_the_flow_bear
     assert warnings(surface_tension=1.3 * bearable)
     fixed = stable_step(solver="dfsph", surface_tension_model="akinci2013", surface_tension=1.0e5)
     assert fixed == pytest.approx(step, rel=ROUNDING)
+
+
+def test_a_dye_that_diffuses_in_no_time_is_told_with_what_is_bearable():
+    def warnings(**water: object) -> list[str]:
+        block = {**WATER["block"][0], "dye": 1.0}
+        far = {**block, "position": (0.0, 0.0, 0.4), "dye": 0.0}
+        fluid = {**WATER, "solver": "dfsph", "block": [block, far], **water}
+        job = Job.model_validate({"name": "a", "frames": 2, "fluid": [fluid]}, strict=False)
+        return [each.message for each in check_job(job).warnings if each.path == ("fluid", 0, "dye_diffusivity")]
+
+    assert warnings(dye_diffusivity=1.0e-5) == []
+    (fast,) = warnings(dye_diffusivity=10.0)
+    bearable = float(fast.partition("use ")[2].partition(" m²/s")[0])
+    assert warnings(dye_diffusivity=bearable) == []
+    assert warnings(dye_diffusivity=1.3 * bearable)
