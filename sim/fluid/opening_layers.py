@@ -16,7 +16,7 @@ from sim.shapes.section import Section, section_of
 NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35  # of particles and of layers: nearer, they would burst out
 LATTICE_CONSTANTS = 1.1, 0.9  # spacings of lattices that are cut to an opening [spacings], largest and smallest
 LATTICES_TRIED = 41  # of them
-SAME_IN_SPACINGS = 1.0e-3  # depths that differ by less are one
+SAME_DEPTH_IN_SPACINGS = 1.0e-3  # depths that differ by less are one
 
 
 @lru_cache(maxsize=64)
@@ -75,7 +75,7 @@ def _cut_layers(section: Section, area: float, spacing: float) -> Iterator[tuple
         order = np.argsort(-depth, kind="stable")
         last, next_ = depth[order[count - 1]], depth[order[count]]
         # Those at one depth, such as four around the middle of a disc, belong together.
-        if last >= 0.0 and last - next_ > SAME_IN_SPACINGS * spacing:
+        if last >= 0.0 and last - next_ > SAME_DEPTH_IN_SPACINGS * spacing:
             yield points[np.sort(order[:count])], constant if count > 1 else math.inf
 
 
