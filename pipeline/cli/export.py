@@ -71,9 +71,9 @@ def export(
     \b
     usd     Houdini, Maya, Omniverse and others: meshes, points, volumes, camera, preview materials
     blend   Blender 4.5 LTS and later: the whole lit scene, which renders the film's frames
-    abc     Alembic, one file: bodies, surfaces, cloths, whitewater and camera; no smoke, no materials
-    vtk     ParaView: one time series of particles, surfaces, cloths, bodies and smoke, with names and units
-    gltf    the web, one .glb: bodies, surfaces, cloths and camera; no smoke, no whitewater, 100 MB at most
+    abc     Alembic, one file: bodies, surfaces, cloths, drops, whitewater and camera; no smoke, no materials
+    vtk     ParaView: one time series of particles, surfaces, drops, cloths, bodies and smoke, with names and units
+    gltf    the web, one .glb: bodies, surfaces, cloths and camera; no smoke, drops or whitewater, 100 MB at most
     openjd  a farm manager: an Open Job Description template of the whole job, which runs it there
 
     \b

@@ -81,7 +81,7 @@ class BlendExport(_SceneExport):
     version = 1
     about = "the scene for Blender"
     opened_by = "open {file} in Blender 4.5 LTS or later; it plays the files beside it"
-    refers_to = ("surfaces", "cloths", "whitewater", "volumes")
+    refers_to = ("surfaces", "cloths", "drops", "whitewater", "volumes")
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame with fluids that touch something, and one for the scene."""
@@ -141,7 +141,7 @@ class BlendExport(_SceneExport):
 
 
 class AbcExport(_SceneExport):
-    """Alembic: bodies, surfaces, cloths, whitewater as loose points, the camera. It has no volumes."""
+    """Alembic: bodies, surfaces, cloths, drops and whitewater as loose points, the camera. It has no volumes."""
 
     format = "abc"
     version = 1

@@ -35,11 +35,12 @@ class GltfExport(ExportStage):
         return ArtifactPath(f"{job.name}.glb")
 
     def left_out(self, job: Job) -> list[str]:
-        """Smoke, whitewater, a zoom."""
+        """Smoke, drops, whitewater, a zoom."""
         keyframes = job.camera.keyframe
         lengths = {key.focal_length_mm or job.camera.focal_length_mm for key in keyframes}
         return [
             *(f"smoke ({each.name})" for each in job.smoke),
+            *(f"drops ({each.name})" for each in (job.fluid if job.surface.drops_per_particle else ())),
             *(f"whitewater ({name})" for name in job.whitewater),
             *(["the camera's zoom"] if len(lengths) > 1 else []),
         ]

@@ -13,7 +13,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
 from pipeline.kinds.stored_arrays import unit_of
-from pipeline.kinds.table import bodies
+from pipeline.kinds.table import bodies, points_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, frame_of, meshes_of
@@ -27,10 +27,10 @@ FOLDER = "vtk"
 
 
 class VtkExport(ExportStage):
-    """Files of each frame: particles, surfaces, cloths, bodies where they are, cells of smoke; one series of them."""
+    """Files of each frame: particles, surfaces, drops, cloths, bodies where they are, cells of smoke; one series."""
 
     format = "vtk"
-    version = 1
+    version = 2
     about = "ParaView's files"
     opened_by = "open {file} in ParaView (paraview {file})"
 
@@ -49,13 +49,12 @@ class VtkExport(ExportStage):
         tasks = []
         for frame in self.chosen(job):
             surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
-            points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
             blocks = [file for _, file in _blocks(job, frame)]
             tasks.append(
                 Task(
                     id=TaskId(f"{self.name}/{frame:06d}"),
                     stage=self.name,
-                    inputs=(layout.frame_cache(frame), *meshes, *surfaces, *points),
+                    inputs=(layout.frame_cache(frame), *meshes, *surfaces, *points_of(job, layout, frame)),
                     outputs=(*blocks, _frame_file(frame)),
                     parameters=parameters,
                     frame=frame,
@@ -92,7 +91,7 @@ def _blocks(job: Job, frame: int) -> list[tuple[str, ArtifactPath]]:
         suffix = "vti" if kind.display.form == "density" else "vtp"
         blocks.append((body.name, suffix))
         if kind.name == "fluid":
-            blocks.append((f"{body.name}.surface", "vtp"))
+            blocks += [(f"{body.name}.surface", "vtp"), (f"{body.name}.drops", "vtp")]
         if body.name in job.whitewater:
             blocks.append((f"{body.name}.whitewater", "vtp"))
     return [(name, ArtifactPath(f"{FOLDER}/{name}/{frame:06d}.{suffix}")) for name, suffix in blocks]
@@ -122,6 +121,7 @@ class _Frame:
             yield body.name, partial(of_form[kind.display.form], body=body)
             if kind.name == "fluid":
                 yield f"{body.name}.surface", partial(self._surface, name=body.name)
+                yield f"{body.name}.drops", partial(self._drops, name=body.name)
             if body.name in self._job.whitewater:
                 yield f"{body.name}.whitewater", partial(self._whitewater, name=body.name)
 
@@ -183,10 +183,19 @@ class _Frame:
         mesh = read_ply(self._layout.path(self._layout.surface(name, self._frame)))
         values = {
             key: Values(array, unit)
-            for key, array, unit in (("velocity", mesh.velocities, "m/s"), ("normals", mesh.normals, "1"))
+            for key, array, unit in (
+                ("velocity", mesh.velocities, "m/s"),
+                ("normals", mesh.normals, "1"),
+                ("dye", None if mesh.dye is None else mesh.dye[:, 0], "1"),
+            )
             if array is not None
         }
         write_polydata(path, mesh.vertices, triangles=mesh.faces, point_values=values, time_s=self._time_s)
+
+    def _drops(self, path: Path, *, name: str) -> None:
+        cloud = read_point_cloud(self._layout.path(self._layout.drops(name, self._frame)))
+        values = {"velocity": Values(cloud.velocity, "m/s"), "radius": Values(cloud.radius, "m")}
+        write_polydata(path, cloud.position, point_values=values, time_s=self._time_s)
 
     def _whitewater(self, path: Path, *, name: str) -> None:
         cloud = read_point_cloud(self._layout.path(self._layout.whitewater(name, self._frame)))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,8 @@ def bodies_at(
         path = layout.root / drawn.file.replace("{frame}", f"{frame:06d}")
         if isinstance(drawn, PointSequenceObject):
             if drawn.file not in read:  # each kind of whitewater is an object of one file
-                yield BodyAtFrame(f"whitewater of {body.name}", read_point_cloud(path).position.astype(np.float64))
+                points = read_point_cloud(path).position.astype(np.float64)
+                yield BodyAtFrame(f"{Path(drawn.file).parts[0]} of {body.name}", points)
             read.add(drawn.file)
             continue
         mesh = read_ply(path)

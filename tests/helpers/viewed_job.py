@@ -9,7 +9,7 @@ from inline_tasks import run_task
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
-from pipeline.base.task import Task, TaskId
+from pipeline.base.task import ArtifactPath, Task, TaskId
 from pipeline.job.loading import load_job
 from pipeline.record.manifest import Manifest
 from pipeline.stages.bodies import BodiesStage
@@ -140,8 +140,8 @@ def commit(layout: JobLayout, frame: int, *, fingerprint: str = "f", energy: flo
     return new.receipt
 
 
-def commit_surface(layout: JobLayout, cached: Receipt, frame: int) -> Receipt:
-    """A surface of the water, made from a frame."""
+def commit_surface(layout: JobLayout, cached: Receipt, frame: int, *, dye: list[float] | None = None) -> Receipt:
+    """A surface of the water, made from a frame: a triangle, with the dye of its vertices if there is any."""
     path = layout.surface("water", frame)
     vertices = bodies_at(frame)["water"].arrays["position"][[0, 9, 90]]
     with committing(
@@ -153,19 +153,29 @@ def commit_surface(layout: JobLayout, cached: Receipt, frame: int) -> Receipt:
         validate=validate_ply,
         inputs={cached.artifact: cached.hash},
     ) as new:
-        write_ply(new.path, vertices, [[0, 1, 2]])
+        write_ply(new.path, vertices, [[0, 1, 2]], dye=None if dye is None else np.array(dye)[:, None])
     return new.receipt
 
 
 def commit_spray(layout: JobLayout, cached: Receipt, frame: int, *, points: int = 50) -> Receipt:
     """Whitewater, made from a frame."""
-    path = layout.whitewater("water", frame)
+    return _commit_points(layout, "whitewater", layout.whitewater("water", frame), cached, frame, points)
+
+
+def commit_drops(layout: JobLayout, cached: Receipt, frame: int, *, points: int = 30) -> Receipt:
+    """Drops of the water's spray, made from a frame."""
+    return _commit_points(layout, "spray", layout.drops("water", frame), cached, frame, points)
+
+
+def _commit_points(
+    layout: JobLayout, stage: str, path: ArtifactPath, cached: Receipt, frame: int, points: int
+) -> Receipt:
     places = np.random.default_rng(frame).uniform(0.2, 0.8, (points, 3)).astype(np.float32)
     ones = np.full(points, 0.005, np.float32)
     with committing(
         layout,
         path,
-        task=_task(f"whitewater/water/{frame:06d}", "whitewater", path),
+        task=_task(f"{stage}/water/{frame:06d}", stage, path),
         attempt=1,
         fingerprint="w",
         validate=validate_point_cloud,

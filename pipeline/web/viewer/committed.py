@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pipeline.base.files import stamp_of
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
+from pipeline.kinds.table import points_of
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
 from pipeline.store.receipts import Receipt, of_newest, read_receipt
@@ -103,7 +104,7 @@ def artifacts_of_frame(job: Job, layout: JobLayout, frame: int | None) -> list[A
         return artifacts
     artifacts.append(layout.frame_cache(frame))
     artifacts += [layout.surface(fluid.name, frame) for fluid in job.fluid]
-    artifacts += [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+    artifacts += points_of(job, layout, frame)
     if job.camera.frames_action:
         last = job.frame_count - 1
         artifacts += [layout.film_bounds(), layout.frame_bounds(frame), layout.frame_bounds(last)]

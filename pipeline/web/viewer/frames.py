@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +27,7 @@ class ShownFrame:
     numbers: FrameNumbers  # number and time of the frame, and what the solvers told
     bodies: Mapping[str, Body] = field(default_factory=dict)  # the bodies
     whitewater: Mapping[str, Particles] = field(default_factory=dict)  # particles
+    drops: Mapping[str, Particles] = field(default_factory=dict)  # of the spray of fluids
     # of fluids, where the surface stage has made them
     surfaces: Mapping[str, SurfaceMesh] = field(default_factory=dict)
     view: View | None = None  # of the film's camera; None while it is not known
@@ -39,7 +41,7 @@ class ShownFrame:
     @property
     def bytes(self) -> int:
         """Memory of its arrays [bytes]."""
-        parts = (*self.bodies.values(), *self.whitewater.values(), *self.surfaces.values())
+        parts = (*self.bodies.values(), *self.whitewater.values(), *self.drops.values(), *self.surfaces.values())
         return sum(array.nbytes for part in parts for array in arrays_of(part))
 
 
@@ -60,35 +62,39 @@ def read_shown_frame(
         raise InvalidArtifactError(f"{path}: lacks what a frame has: {error}") from error
     meshes: dict[str, SurfaceMesh] = {}
     whitewater: dict[str, Particles] = {}
+    drops: dict[str, Particles] = {}
     troubles: list[str] = []
     for fluid in job.fluid:
         surface = layout.surface(fluid.name, frame)
-        cloud = layout.whitewater(fluid.name, frame)
+        cloud, spray = layout.whitewater(fluid.name, frame), layout.drops(fluid.name, frame)
         try:
             if surfaces and committed.derived(frame, surface):
                 mesh = read_ply(layout.path(surface))
                 meshes[fluid.name] = SurfaceMesh(own(mesh.vertices), own(mesh.faces))
             if fluid.name in job.whitewater and committed.derived(frame, cloud):
-                whitewater[fluid.name] = _whitewater(layout, fluid.name, frame, most_particles)
+                whitewater[fluid.name] = _points("whitewater", layout.path(cloud), most_particles)
+            if committed.derived(frame, spray):
+                drops[fluid.name] = _points("drops", layout.path(spray), most_particles)
         except (InvalidFileError, OSError) as error:
             troubles.append(f"frame {frame}: {error}; see: pipeline verify")
     return ShownFrame(
         numbers,
         bodies=bodies,
         whitewater=whitewater,
+        drops=drops,
         surfaces=meshes,
         view=_view(job, layout, committed, frame, bodies),
         troubles=tuple(troubles),
     )
 
 
-def _whitewater(layout: JobLayout, fluid: str, frame: int, most: int) -> Particles:
-    cloud = read_point_cloud(layout.path(layout.whitewater(fluid, frame)))
+def _points(kind: str, path: Path, most: int) -> Particles:
+    cloud = read_point_cloud(path)
     count = len(cloud.position)
     chosen = slice(None, None, every(count, most))
     radius = float(cloud.radius.mean()) if count else 0.0
     speed = np.linalg.norm(cloud.velocity[chosen], axis=1).astype(np.float32)
-    return Particles("whitewater", own(cloud.position[chosen]), {SPEED: speed}, radius, None, count)
+    return Particles(kind, own(cloud.position[chosen]), {SPEED: speed}, radius, None, count)
 
 
 def _view(

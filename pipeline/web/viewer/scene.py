@@ -1,4 +1,4 @@
-"""A job's cached frames on the canvas: bodies, and around them surfaces, whitewater, pins, the domain, the camera."""
+"""A job's cached frames on the canvas: bodies, and around them surfaces, drops, whitewater, pins, domain, camera."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from render.meshes import read_ply
 from sim.core.motion.rotation import from_degrees
 
 DOMAIN_COLOR, CAMERA_COLOR = (120, 130, 146), (240, 190, 90)
-SURFACES, SPRAY, DOMAIN, PINS, CAMERA = "Surfaces", "Whitewater", "Domain", "Pins", "Camera"
+SURFACES, DROPS, SPRAY, DOMAIN, PINS, CAMERA = "Surfaces", "Drops", "Whitewater", "Domain", "Pins", "Camera"
 """Layers beside those of the kinds of bodies."""
 
 
@@ -48,6 +48,7 @@ class JobScene:
         has = {
             **{kind.display.layer: kind.bodies(job) for kind in KINDS.values()},
             SURFACES: job.fluid,
+            DROPS: job.fluid and job.surface.drops_per_particle,
             SPRAY: job.whitewater,
             DOMAIN: True,
             PINS: any(cloth.pin for cloth in job.cloth),
@@ -71,6 +72,10 @@ class JobScene:
                     opacity = 0.45 if KINDS["fluid"].display.layer in layers else None
                     color = color_of(job, name, BODY, SURFACE)
                     canvas.mesh(f"/surface/{name}", mesh.vertices, mesh.faces, color, opacity=opacity)
+            if DROPS in layers:
+                for name, cloud in frame.drops.items():
+                    color = color_of(job, name, BODY, SURFACE)
+                    canvas.points(f"/drops/{name}", cloud.position, color, radius=cloud.radius)
             if SPRAY in layers:
                 for name, cloud in frame.whitewater.items():
                     canvas.points(f"/whitewater/{name}", cloud.position, WHITEWATER, radius=cloud.radius)

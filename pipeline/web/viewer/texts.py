@@ -33,7 +33,8 @@ def notice(troubles: Sequence[str], remarks: Sequence[str]) -> str:
 
 def thinned(shown: ShownFrame) -> list[str]:
     """Numbers of drawn particles, where not all are."""
-    clouds = {**shown.clouds, **{f"whitewater of {name}": of for name, of in shown.whitewater.items()}}
+    made = {"drops": shown.drops, "whitewater": shown.whitewater}
+    clouds = {**shown.clouds, **{f"{kind} of {name}": of[name] for kind, of in made.items() for name in of}}
     return [
         f"{name}: {len(cloud.position):,} of {cloud.count:,} particles are drawn"
         for name, cloud in clouds.items()

@@ -15,6 +15,7 @@ from pipeline.run.checked_job import needs_pictures
 from pipeline.run.plan import plan_job
 from pipeline.show.handing_over import refuse_if_busy
 from pipeline.stages import EXPORTS, STAGES
+from pipeline.stages.render_scene import render_spec
 
 SMOKE = """
 name = "tank"
@@ -24,6 +25,20 @@ frames = 6
 name = "plume"
 cell_size = 0.1
 source = [{ shape = { type = "sphere", radius = 0.2 }, position = [0.0, 0.0, 0.3] }]
+"""
+SPLASH = """
+name = "tank"
+frames = 3
+[whitewater.water]
+[[fluid]]
+name = "water"
+[[fluid.block]]
+shape = { type = "box", size = [0.2, 0.2, 0.2] }
+position = [0.0, 0.0, 0.3]
+[[cloth]]
+name = "flag"
+shape = { type = "rectangle", size = [0.4, 0.4], counts = [5, 5] }
+position = [0.0, 0.0, 0.9]
 """
 BALL = """
 [[rigid]]
@@ -102,6 +117,32 @@ def test_what_is_given_away_ends_with_the_file_to_open(name):
     assert files[-1] == EXPORTS[name].root(job)
     assert not [each for each in files if each.startswith("cache/")]
     assert any(each.endswith(".vdb") for each in files) == (name in ("usd", "blend"))
+
+
+def test_every_file_that_a_blend_file_plays_is_given_away_with_it():
+    job = job_of_text(SPLASH + SMOKE.partition("\n\n")[2] + BALL, Path("job.toml"))
+    files = EXPORTS["blend"].belonging(plan_job(job, LAYOUT, STAGES, ("export-blend",)))
+    objects = [each for each in render_spec(job, LAYOUT).objects if "{frame}" in each.file]
+    assert {Path(each.file).parts[0] for each in objects} == {"surfaces", "cloths", "drops", "whitewater", "volumes"}
+    for each in objects:
+        # Fluids are there as they are drawn.
+        file = each.file.replace("surfaces/", "blend/")
+        assert {file.replace("{frame}", f"{frame:06d}") for frame in range(3)} <= set(files)
+
+
+@pytest.mark.parametrize("name", ["usd", "abc", "vtk"])
+def test_what_copies_points_into_its_own_files_reads_the_drops_of_every_frame(name):
+    tasks = exported(SPLASH, f"export-{name}").values()
+    read = {each for task in tasks for each in task.inputs}
+    assert {LAYOUT.drops("water", frame) for frame in range(3)} <= read
+    assert "drops" not in EXPORTS[name].refers_to
+
+
+def test_gltf_says_that_it_has_no_drops():
+    told = EXPORTS["gltf"].left_out(job_of_text(SPLASH, Path("job.toml")))
+    assert told == ["drops (water)", "whitewater (water)"]
+    none = job_of_text(SPLASH + "[surface]\ndrops_per_particle = 0\n", Path("job.toml"))
+    assert EXPORTS["gltf"].left_out(none) == ["whitewater (water)"]
 
 
 def test_an_export_does_not_take_the_place_of_a_film_that_waits(tmp_path):

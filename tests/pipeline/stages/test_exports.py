@@ -11,12 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import viewed_job
 from exported_jobs import FRAMES, simulated
 from films import Studio
+from inline_tasks import run_task
 from places import PROJECT
 
 from pipeline.job.loading import load_job
+from pipeline.run.events import Finished
 from pipeline.run.goal import read_goal
+from pipeline.stages import EXPORTS
 from pipeline.store.cache import read_frame
 from render.errors import InvalidFileError
 from render.gltf_files import read_glb
@@ -94,7 +98,7 @@ def points(block: Any) -> np.ndarray:
 
 def test_vtk_reads_what_the_cache_has(vtk):
     blocks = blocks_of(vtk.layout.root / f"vtk/{LAST:06d}.vtm")
-    names = {"ball", "duck", "water", "water.surface", "water.whitewater", "sheet", "plume"}
+    names = {"ball", "duck", "water", "water.surface", "water.drops", "water.whitewater", "sheet", "plume"}
     assert blocks.keys() == names
     for body in ("water", "sheet"):
         there = cached(vtk, body, LAST).arrays
@@ -104,6 +108,23 @@ def test_vtk_reads_what_the_cache_has(vtk):
     assert blocks["water.surface"].GetNumberOfCells() == len(mesh.faces)
     np.testing.assert_array_equal(array(blocks["water.surface"].GetPointData(), "velocity"), mesh.velocities)
     np.testing.assert_array_equal(array(blocks["water.whitewater"].GetPointData(), "kind"), cloud.kind)
+
+
+def test_vtk_reads_drops_with_radii_and_dye_of_the_surface(tmp_path):
+    layout = viewed_job.submitted(tmp_path / "job")
+    receipt = viewed_job.commit(layout, 0)
+    viewed_job.commit_surface(layout, receipt, 0, dye=[0.0, 0.25, 1.0])
+    viewed_job.commit_spray(layout, receipt, 0)
+    viewed_job.commit_drops(layout, receipt, 0)
+    task, *_ = EXPORTS["vtk"].plan(load_job(layout.job_file), layout)
+    assert isinstance(run_task(task, layout), Finished)
+    blocks = blocks_of(layout.root / "vtk/000000.vtm")
+    drops = read_point_cloud(layout.path(layout.drops("water", 0)))
+    assert len(drops.radius) == 30
+    np.testing.assert_array_equal(points(blocks["water.drops"]), drops.position)
+    np.testing.assert_array_equal(array(blocks["water.drops"].GetPointData(), "radius"), drops.radius)
+    np.testing.assert_array_equal(array(blocks["water.drops"].GetPointData(), "velocity"), drops.velocity)
+    assert array(blocks["water.surface"].GetPointData(), "dye").tolist() == [0.0, 0.25, 1.0]
 
 
 def test_vtk_reads_the_grid_of_smoke_with_x_first(vtk):
@@ -299,7 +320,7 @@ print("TOLD", json.dumps(told))
 @pytest.fixture(scope="module")
 def gltf(studio) -> Path:
     ended = studio.run("export", "tiny", "--to", "gltf").assert_code(0)
-    assert "left out" in ended.out and "smoke (plume), whitewater (water)" in ended.out
+    assert "left out" in ended.out and "smoke (plume), drops (water), whitewater (water)" in ended.out
     return studio.layout.root / "tiny.glb"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath
 from pipeline.job.loading import load_job
 from pipeline.run.events import RunStarted, TaskEvent, Warned
 from pipeline.run.executors.attempt import AttemptContext
@@ -18,6 +19,7 @@ from pipeline.stages.render import RenderStage
 from pipeline.stages.render_scene import camera_path
 from pipeline.stages.visibility import CAMERA_INSIDE, NOTHING_SEEN, bodies_at, warn_if_invisible
 from render.meshes import write_ply
+from render.point_clouds import PointCloud, write_point_cloud
 
 JOB = """
 name = "pond"
@@ -42,6 +44,14 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
+def write_points(layout: JobLayout, artifact: ArtifactPath, count: int) -> None:
+    """Points in the place of the tetrahedron."""
+    path = layout.path(artifact)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows, ones = np.zeros((count, 3), np.float32), np.ones(count, np.float32)
+    write_point_cloud(path, PointCloud(rows, rows, ones, ones, np.zeros(count, np.uint8)))
+
+
 def warnings_of(
     folder: Path, *, position: list[float], look_at: list[float], ball: list[float], water: bool = True
 ) -> list[Warned]:
@@ -56,6 +66,7 @@ def warnings_of(
             write_ply(path, scale * TETRAHEDRON, FACES)
         else:
             write_ply(path, np.zeros((0, 3)), np.zeros((0, 3)))
+    write_points(layout, layout.drops("water", 2), 0)
     task = RenderStage().plan(job, layout)[2]
     events: list[TaskEvent] = []
     assignment = Assignment(task, 1, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES")
@@ -85,6 +96,19 @@ def test_a_camera_in_the_water_or_in_a_body_is_told(tmp_path):
     assert warned.kind == CAMERA_INSIDE and '"water"' in warned.message
     (warned,) = warnings_of(tmp_path, **inside, ball=[0.0, 0.0, 0.0], water=False)
     assert warned.kind == CAMERA_INSIDE and '"ball"' in warned.message
+
+
+def test_points_are_called_by_what_is_drawn(tmp_path):
+    layout = JobLayout(tmp_path)
+    layout.job_file.write_text(JOB.format(position=[0, -4, 0], look_at=[0, 0, 0]) + "[whitewater.water]\n")
+    for artifact in (layout.body_mesh("ball"), layout.surface("water", 2)):
+        layout.path(artifact).parent.mkdir(parents=True)
+        write_ply(layout.path(artifact), TETRAHEDRON, FACES)
+    write_points(layout, layout.drops("water", 2), 3)
+    write_points(layout, layout.whitewater("water", 2), 5)
+    poses = {"ball": {"position": np.zeros(3), "orientation": UPRIGHT}}
+    found = {each.name: len(each.points) for each in bodies_at(load_job(layout.job_file), layout, 2, poses)}
+    assert found == {"ball": 4, "water": 4, "drops of water": 3, "whitewater of water": 5}
 
 
 class Lines:

@@ -25,7 +25,7 @@ from pipeline.web.viewer.committed import CommittedFrames, artifacts_of_frame
 from pipeline.web.viewer.frames import ShownFrame, read_shown_frame
 from pipeline.web.viewer.numbers import SolverSeries, plot_data, table
 from pipeline.web.viewer.playback import Playback
-from pipeline.web.viewer.texts import lacking, legend
+from pipeline.web.viewer.texts import lacking, legend, thinned
 from render.camera_path import View
 from render.visibility import in_picture
 
@@ -57,12 +57,15 @@ def test_a_frame_without_a_receipt_is_not_there(layout):
     assert committed.numbers == (0, 1)
 
 
-def test_the_stamp_of_a_frame_changes_when_its_surface_arrives(layout):
+def test_the_stamp_of_a_frame_changes_when_its_surface_or_its_drops_arrive(layout):
     job, cached = load_job(layout.job_file), viewed_job.commit(layout, 0)
     committed = CommittedFrames(layout)
     before = committed.stamp(artifacts_of_frame(job, layout, 0))
     viewed_job.commit_surface(layout, cached, 0)
-    assert committed.stamp(artifacts_of_frame(job, layout, 0)) != before
+    with_surface = committed.stamp(artifacts_of_frame(job, layout, 0))
+    assert with_surface != before
+    viewed_job.commit_drops(layout, cached, 0)
+    assert committed.stamp(artifacts_of_frame(job, layout, 0)) != with_surface
 
 
 # --- what a frame has ----------------------------------------------------------------------------------------------
@@ -72,6 +75,7 @@ def test_every_kind_of_body_is_read(layout):
     cached = viewed_job.commit(layout, 4)
     viewed_job.commit_surface(layout, cached, 4)
     viewed_job.commit_spray(layout, cached, 4)
+    viewed_job.commit_drops(layout, cached, 4)
     frame = shown(layout, 4)
     bodies = viewed_job.bodies_at(4)
     water = frame.clouds["water"]
@@ -82,6 +86,7 @@ def test_every_kind_of_body_is_read(layout):
     assert len(frame.bodies["flag"].triangles) == 32
     assert float(frame.bodies["plume"].density.sum()) == pytest.approx(float(bodies["plume"].arrays["density"].sum()))
     assert len(frame.whitewater["water"].position) == 50
+    assert len(frame.drops["water"].position) == 30
     assert frame.view is not None
     assert frame.troubles == ()
     assert frame.numbers.time_s == read_frame(layout.path(layout.frame_cache(4))).time_s
@@ -197,13 +202,15 @@ def test_a_kept_frame_keeps_no_array_in_memory_that_is_larger_than_what_is_shown
     cached = viewed_job.commit(layout, 0)
     viewed_job.commit_surface(layout, cached, 0)
     viewed_job.commit_spray(layout, cached, 0, points=500)
+    viewed_job.commit_drops(layout, cached, 0, points=500)
     frame = shown(layout, 0, most=most)
     arrays = [frame.surfaces["water"].vertices, frame.surfaces["water"].faces]
-    for cloud in (frame.clouds["water"], frame.whitewater["water"]):
+    for cloud in (frame.clouds["water"], frame.whitewater["water"], frame.drops["water"]):
         assert len(cloud.position) < 500
         arrays += [cloud.position, *cloud.values.values()]
     for array in arrays:
         assert array.base is None or array.base.nbytes == array.nbytes
+    assert [each.partition(":")[0] for each in thinned(frame)] == ["water", "drops of water", "whitewater of water"]
 
 
 # --- playing -------------------------------------------------------------------------------------------------------

@@ -100,6 +100,7 @@ def test_a_job_is_drawn_scrubbed_and_played_in_two_pages(tmp_path: Path, window:
     for frame in range(6):
         receipt = viewed_job.commit(layout, frame)
         viewed_job.commit_spray(layout, receipt, frame)
+        viewed_job.commit_drops(layout, receipt, frame)
     with served(layout, most_particles=500) as view, opened(window, view) as browser:
         complaints: list[str] = []
         browser.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
@@ -115,6 +116,7 @@ def test_a_job_is_drawn_scrubbed_and_played_in_two_pages(tmp_path: Path, window:
             "/domain",
             "/camera",
             "/whitewater/water",
+            "/drops/water",
         } == view.page.canvas.names
         plotted = "Object.values(window.__viserTestpoints.uplots).map(each => each.chart.scales.y.max > 0)"
         wait_for(lambda: browser.evaluate(plotted) == [True], "a plot of the numbers", browser)
