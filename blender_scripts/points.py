@@ -1,4 +1,4 @@
-"""Whitewater: points from PLY files into Blender, drawn as spheres."""
+"""Drops and whitewater: points from PLY files into Blender, drawn as spheres."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ def dye_at(vertices: ArrayLike, positions: ArrayLike, dye: ArrayLike, *, particl
     """Concentration of dye at vertices [-], (n, 1): sum_j c_j W_j / sum_j W_j, never beyond those of the particles.
 
     Args:
-        vertices: (n, 3) [m]; one far from all particles, as droplets are drawn finer, has that of the nearest.
+        vertices: (n, 3) [m]; one farther than the kernel from all particles has that of the nearest.
         positions: of the particles [m], (m, 3).
         dye: their concentrations [-], (m,).
         particle_radius: [m], half the spacing of the particles at rest.

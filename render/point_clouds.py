@@ -1,4 +1,4 @@
-"""Whitewater as binary PLY files of points, written and read with numpy alone; `blender_scripts.ply` has the layout."""
+"""Drops and whitewater as binary PLY files of points, by numpy alone; `blender_scripts.ply` has the layout."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PointCloud:
         position: [m], (n, 3), float32.
         velocity: [m/s], (n, 3), float32.
         radius: [m], (n,), float32.
-        lifetime: what is left of it [s], (n,), float32.
+        lifetime: what is left of it [s], (n,), float32; drops do not fade.
         kind: index into `KINDS`, (n,), uint8.
         not_made: particles that the frame should have got, and had no room for.
     """

@@ -60,8 +60,8 @@ until_option = click.option(
     multiple=True,
     callback=_known_ends,
     metavar="STAGE",
-    help="End after this stage: simulate, surface, cloth, volume, whitewater, render, ...; or after frames of it, as "
-    "render:0-9. May be given several times.",
+    help="End after this stage: simulate, spray, surface, cloth, volume, whitewater, render, ...; or after frames of "
+    "it, as render:0-9. May be given several times.",
 )
 
 

@@ -7,6 +7,7 @@ from collections import namedtuple
 import click
 import pytest
 
+from blender_scripts.ply import POINT
 from pipeline.cli.arguments import parse_age, parse_size
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
@@ -21,6 +22,30 @@ def test_files_take_what_their_elements_and_pixels_take():
     assert disk.bytes_per_artifact("simulate", SIZE) == pytest.approx(22_000 + 26e6)
     assert disk.bytes_per_artifact("render", SIZE) == pytest.approx(1_000 + 1.2 * 1920 * 1080)
     assert disk.checkpoint_bytes(SIZE) == pytest.approx(2 * 90e6)
+
+
+def test_drops_count_with_what_the_spray_breaks_up_into():
+    assert POINT.itemsize == 33
+    two_files = 2.0 * disk.bytes_per_artifact("spray", SIZE._replace(drops_per_particle=40.0))
+    # 3 % of the particles are spray, of which each is 40 drops; films of three splashes had 13 to 27 bytes a particle.
+    assert two_files == pytest.approx(1e6 * (1.0 + 0.03 * 40 * 33))
+    assert disk.bytes_per_artifact("spray", SIZE) == pytest.approx(0.5e6)
+
+
+@pytest.mark.parametrize(
+    ("radius", "surface", "drops"),
+    [
+        (0.02, {}, 40),
+        (0.02, {"drops_per_particle": 7}, 7),
+        (0.02, {"drops_per_particle": 0}, 0),
+        (0.002, {}, 7),  # a cube of 4 mm is 6.2 balls of 2.7 mm
+    ],
+)
+def test_a_particle_breaks_up_into_no_more_drops_than_it_has_volume_for(radius, surface, drops):
+    block = {"shape": {"type": "box", "size": [0.1, 0.1, 0.1]}, "position": [0.0, 0.0, 0.2]}
+    fluid = [{"name": "water", "particle_radius": radius, "block": [block]}]
+    job = Job.model_validate({"name": "tank", "frames": 1, "fluid": fluid, "surface": surface}, strict=False)
+    assert disk.size_of(job, Findings()).drops_per_particle == drops
 
 
 @pytest.mark.parametrize(
