@@ -1,8 +1,9 @@
 """Bodies: the mesh of each rigid body in its rest pose, for the renderer."""
 
-from collections.abc import Mapping
+from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from blender_scripts.look_table import LOOK_TABLE
 from pipeline.base.content import tool_version
@@ -20,13 +21,16 @@ from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.parameters import MeshShape
 from sim.shapes.solid import TriangleMesh
 
+if TYPE_CHECKING:
+    from sim.shapes.placement import PlacedSolid
+
 MESH_S = 2.0
 """Time of meshing a body, its worker's start included [s]."""
 EDGE_IN_RADII = 1.5
 """Longest edge of a body that light goes through, in radii of a fluid's particles: its vertices tell where the fluid
 covers it (`blender_scripts.wetting`)."""
 MOST_TRIANGLES = 500_000
-"""About how many such a body has at most: a larger one has a coarser line where the fluid ends."""
+"""How many such a body has at most, but for those of its file: a larger one has a coarser line where the fluid ends."""
 
 
 class BodiesStage(Stage):
@@ -34,7 +38,7 @@ class BodiesStage(Stage):
 
     name = "bodies"
     about = "meshes of rigid bodies"
-    version = 2
+    version = 3
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a body."""
@@ -69,10 +73,8 @@ class BodiesStage(Stage):
 
         parameters = next(body for body in context.job.rigid if body.name == context.task.subject)
         solid = build_solid(parameters)
-        mesh = solid.rest_mesh()
-        if (edge := _longest_edge(context.job, parameters)) is not None:
-            area = float(np.linalg.norm(mesh.area_vectors, axis=1).sum())
-            mesh = solid.rest_mesh(max(edge, (area / MOST_TRIANGLES) ** 0.5))
+        edge = _longest_edge(context.job, parameters)
+        mesh = solid.rest_mesh() if edge is None else mesh_within(solid, edge, most=MOST_TRIANGLES)
         shape, uv = parameters.shape, None
         if isinstance(shape, MeshShape) and _is_textured(context.job, parameters):
             at_own_size = TriangleMesh(mesh.vertices / parameters.scale, mesh.faces)
@@ -82,6 +84,25 @@ class BodiesStage(Stage):
             with context.committing(output, validate_ply) as path:
                 write_ply(path, piece.vertices, piece.faces, corner_uv=uv)
         context.progress(1, 1)
+
+
+def mesh_within(solid: PlacedSolid, max_edge: float, *, most: int) -> TriangleMesh:
+    """The surface of a solid at rest with edges of at most `max_edge` [m], or as fine as so many triangles can be.
+
+    Edges are shortened step by step: how many triangles an edge makes depends on the shape, so that none is made that
+    has many more. If they do not suffice, edges are up to about sqrt(2) longer than they could be.
+    """
+    from sim.shapes.tessellation import longest_edge
+
+    mesh = solid.rest_mesh()
+    edge = longest_edge(mesh)
+    while edge > max_edge:
+        edge = max(max_edge, edge / 2.0**0.5)
+        finer = solid.rest_mesh(edge)
+        if len(finer.faces) > most:
+            break
+        mesh = finer
+    return mesh
 
 
 def _longest_edge(job: Job, body: RigidBodyParameters) -> float | None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim.shapes.mass_properties import integrate_moments
 from sim.shapes.sampling import stratified_points
 from sim.shapes.solid import Points, RestShape, ShapeError, TriangleMesh, boundary_edges
-from sim.shapes.tessellation import longest_edge, subdivide
+from sim.shapes.tessellation import halve_long_edges, longest_edge
 
 _DECIDED_WITHIN = 0.1  # of an integer a winding number is decided; beside a hemisphere it is off by 0.15 to 0.25
 _LARGEST_UNDECIDED = 0.2  # largest fraction of the surface beside which the inside may be undecided
@@ -87,10 +87,10 @@ class MeshSolid(RestShape):
         return np.stack([self.winding_number(points - step), self.winding_number(points + step)], axis=1)
 
     def surface_mesh(self, max_edge: float | None) -> TriangleMesh:
-        """The mesh with its caps; every triangle cut into four until no edge is longer than `max_edge` [m]."""
+        """The mesh with its caps; edges cut in two until none is longer than `max_edge` [m]."""
         mesh = self.mesh
         while max_edge is not None and longest_edge(mesh) > max_edge:
-            mesh = subdivide(mesh)
+            mesh = halve_long_edges(mesh, max_edge)
         return mesh
 
     @cached_property

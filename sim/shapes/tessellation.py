@@ -99,16 +99,38 @@ def longest_edge(mesh: TriangleMesh) -> float:
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
-def subdivide(mesh: TriangleMesh) -> TriangleMesh:
-    """The same surface with every triangle cut into four at the midpoints of its edges; parts are kept."""
+def halve_long_edges(mesh: TriangleMesh, max_edge: float) -> TriangleMesh:
+    """The same surface with edges longer than `max_edge` cut at their midpoints, in both triangles; parts are kept.
+
+    A triangle becomes two, three or four. Of three, the shorter diagonal parts the two beside the shortest edge: no new
+    edge is longer than sqrt(3)/2 of the triangle's longest, so that rounds of this come to an end.
+    """
     edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     unique_edges, edge = np.unique(edges, axis=0, return_inverse=True)
-    ab, bc, ca = (edge.reshape(-1, 3) + len(mesh.vertices)).T
-    a, b, c = mesh.faces.T
-    quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    faces = np.stack([np.stack(quarter, axis=1) for quarter in quarters], axis=1).reshape(-1, 3).astype(np.int32)
-    vertices = np.concatenate([mesh.vertices, mesh.vertices[unique_edges].mean(axis=1)])
-    part = None if mesh.part is None else np.repeat(mesh.part, 4)
+    is_long = np.linalg.norm(np.diff(mesh.vertices[unique_edges], axis=1)[:, 0], axis=1) > max_edge
+    vertices = np.concatenate([mesh.vertices, mesh.vertices[unique_edges[is_long]].mean(axis=1)])
+    middle = (len(mesh.vertices) - 1 + np.cumsum(is_long))[edge].reshape(-1, 3)
+    cut = is_long[edge].reshape(-1, 3)
+    count = cut.sum(axis=1)
+
+    # Turned so that a lone cut edge comes first, and a lone whole one.
+    first = np.argmax(np.where((count == 1)[:, None], cut, ~cut), axis=1)
+    order = (first[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(mesh.faces, order, axis=1).T
+    ab, bc, ca = np.take_along_axis(middle, order, axis=1).T
+    from_a = np.linalg.norm(vertices[a] - vertices[bc], axis=1)
+    from_b = np.linalg.norm(vertices[b] - vertices[ca], axis=1)
+    two, a_to_bc = count == 2, from_a <= from_b
+    pieces = [
+        (count == 0, [(a, b, c)]),
+        (count == 1, [(a, ab, c), (ab, b, c)]),
+        (two & a_to_bc, [(c, ca, bc), (a, b, bc), (a, bc, ca)]),
+        (two & ~a_to_bc, [(c, ca, bc), (a, b, ca), (b, bc, ca)]),
+        (count == 3, [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]),
+    ]
+    made = [(np.stack(corners, axis=1)[which], which) for which, each in pieces for corners in each]
+    faces = np.concatenate([corners for corners, _ in made]).astype(np.int32)
+    part = None if mesh.part is None else np.concatenate([mesh.part[which] for _, which in made])
     return TriangleMesh(vertices, faces, part, mesh.part_names)
 
 

@@ -1,6 +1,7 @@
 """Checks of bodies that would float, but start flush on the domain's floor under a fluid."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.kinds.base import Solids
 from pipeline.model.amounts import rounded_down
@@ -34,11 +35,11 @@ def check_pressed_bodies(job: Job, solids: Solids, findings: Findings) -> None:
         if gap >= ALL * spacing:
             continue
         mass = body.density * solid.volume + sum(ballast.mass for ballast in body.ballast)
-        mesh = solid.surface_mesh(spacing)
-        areas, heights = mesh.area_vectors, sign * (floor - mesh.corners.mean(axis=1)[:, down])
+        mesh = solid.surface_mesh()
+        areas, heights = mesh.area_vectors, sign * (floor - mesh.corners[:, :, down])
         facing = sign * areas[:, down]
-        is_flat = (facing > LEAST_COSINE * np.linalg.norm(areas, axis=1)) & (heights < spacing)
-        dry = float(facing[is_flat].sum())
+        is_flat = facing > LEAST_COSINE * np.linalg.norm(areas, axis=1)
+        dry = float((facing * _share_below(spacing, heights))[is_flat].sum())
         for path, block in solids.items():
             if path[0] != "fluid" or not touch(block.bounds, solid.bounds, margin=spacing):
                 continue
@@ -54,3 +55,12 @@ def check_pressed_bodies(job: Job, solids: Solids, findings: Findings) -> None:
                     "floor" + (f", or use particle_radius {rounded_down(0.5 * gap):g} m" if gap > 0.0 else ""),
                 )
                 break
+
+
+def _share_below(level: float, heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of the area of triangles below a level [-], (n,), by the heights of their corners, (n, 3)."""
+    low, middle, high = np.sort(heights, axis=1).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        up_to_middle = (level - low) ** 2 / ((middle - low) * (high - low))
+        from_middle = 1.0 - (high - level) ** 2 / ((high - low) * (high - middle))
+    return np.select([level >= high, level <= low, level < middle], [1.0, 0.0, up_to_middle], from_middle)

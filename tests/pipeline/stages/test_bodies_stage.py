@@ -14,8 +14,11 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import Task
 from pipeline.job.loading import load_job
 from pipeline.run.events import Finished
-from pipeline.stages.bodies import BodiesStage
+from pipeline.stages.bodies import BodiesStage, mesh_within
 from render.meshes import read_ply
+from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
+from sim.shapes.tessellation import longest_edge
 
 JOB = """
 name = "film"
@@ -97,3 +100,32 @@ def test_a_body_that_fluid_is_seen_through_is_as_fine_as_the_particles(layout):
         assert np.ptp(mesh.vertices, axis=0) == pytest.approx([0.1] * 3)
     assert longest[LOOK] > 0.1
     assert longest[glass] <= 1.5 * 0.004
+
+
+PROFILE = [(0.0, 0.0), (0.3, 0.0), (0.3, 0.01), (0.01, 0.02), (0.01, 1.0), (0.0, 1.0)]  # a foot of 0.3 m, a thin stem
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"type": "box", "size": (1.0, 0.7, 0.01)},
+        {"type": "cylinder", "radius": 0.005, "height": 4.0},
+        {"type": "sphere", "radius": 0.5},
+        {"type": "torus", "major_radius": 0.5, "minor_radius": 0.01},
+        {"type": "revolved", "profile": PROFILE},
+        {"type": "mesh", "file": "rod.obj"},
+    ],
+    ids=lambda shape: shape["type"],
+)
+def test_a_body_has_as_many_triangles_as_it_may_and_no_more(shape, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.cylinder(radius=0.01, height=1.0, sections=320).export(tmp_path / "rod.obj")
+    solid = build_solid(Placement.model_validate({"shape": shape}))
+    most, finest = 60_000, 1.0e-4
+    mesh = mesh_within(solid, finest, most=most)
+    assert mesh.is_closed
+    assert most / 5.0 < len(mesh.faces) <= most  # a sphere's are four times as many or none
+    assert mesh.signed_volume == pytest.approx(solid.volume, rel=1.5e-3)
+    coarse = mesh_within(solid, 0.07, most=most)
+    assert len(coarse.faces) < most
+    assert longest_edge(coarse) <= 0.07

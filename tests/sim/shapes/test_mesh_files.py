@@ -188,6 +188,17 @@ def test_max_edge_refines_without_opening_the_mesh(tmp_path):
     assert mesh.signed_volume == pytest.approx(solid.volume, rel=1e-12)
 
 
+def test_max_edge_cuts_long_edges_alone(tmp_path):
+    """Triangles of a needle become three, not four, where their two long edges are halved, nine times."""
+    trimesh.creation.box((0.001, 0.001, 1.0)).export(tmp_path / "needle.stl")
+    mesh = mesh_solid(tmp_path / "needle.stl").surface_mesh(max_edge=0.002)
+    assert np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2).max() <= 0.002
+    assert mesh.is_closed
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+    assert len(mesh.faces) < 12 * 3**9
+    assert mesh.signed_volume == pytest.approx(1.0e-6, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

@@ -413,6 +413,7 @@ position = [0.0, 0.0, {height}]
 
 
 BOX, TALL = ('type = "box", size = [0.1, 0.1, 0.08]', 'type = "box", size = [0.1, 0.1, 0.4]')
+TILTED = 'type = "box", size = [0.4, 0.1, 0.027]'
 BALL = 'type = "sphere", radius = 0.05'
 
 
@@ -426,6 +427,8 @@ BALL = 'type = "sphere", radius = 0.05'
         (floater(BALL, 0.05, 300.0), None),  # measured, it rises
         (floater(BOX, 0.04, 300.0, more="rotation_deg = [0.0, 30.0, 0.0]"), None),  # on an edge: below the floor
         (floater(TALL, 0.2, 300.0), "0.24 m of fluid"),
+        # Tilted by 10 degrees: of an underside 0.1 m wide 0.02 / tan(10) = 0.113 m are less than a spacing up.
+        (floater(TILTED, 0.0481, 300.0, more="rotation_deg = [0.0, 10.0, 0.0]"), "on 0.011 m²"),
     ],
 )
 def test_a_light_body_that_starts_flush_on_the_floor_is_told_that_it_stays_there(body, told, tmp_path):
