@@ -75,7 +75,7 @@ LOOK_TABLE: dict[str, LookRow] = {
     "stone": LookRow(SURFACES, ("roughness",), swims_on=("fluid", "cloth"), fits_sheets=True, paves=True, revision=2),
     "wood": LookRow(SURFACES, ("roughness",), swims_on=("fluid",), fits_sheets=True, paves=True, revision=2),
     "glass": LookRow(SURFACES, ("roughness", "caustics"), revision=2),
-    "drops": LookRow(SURFACES, ("roughness",)),
+    "drops": LookRow(SURFACES, ("roughness",), revision=2),
     "spray": LookRow(SURFACES, ("roughness",)),
     "foam": LookRow(SURFACES),
     "bubbles": LookRow(SURFACES, ("roughness",)),

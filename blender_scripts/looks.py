@@ -170,10 +170,12 @@ def _drops(builder: NodeBuilder, context: LookContext) -> None:
     """Drops of a clear liquid that a picture does not resolve: mirrors by Fresnel's law, and what enters goes forward.
 
     A ball of water turns light by so little that all but 15 % of it goes on as if it were not there (asymmetry 0.85 in
-    geometric optics, Bohren & Huffman 1983); that share is scattered. Points are hit on their front only.
+    geometric optics, Bohren & Huffman 1983); that share is scattered. Points are hit on their front only. A colour is
+    that of the liquid through a drop, whichever way light leaves it.
     """
     scattered = _scattering(builder, or_default(context.color, (0.97, 0.985, 1.0)))
-    inner = builder.mix_shaders(DROPS_GO_FORWARD, scattered, builder.node("ShaderNodeBsdfTransparent"))
+    through = builder.node("ShaderNodeBsdfTransparent", Color=or_default(context.color, (1.0, 1.0, 1.0)))
+    inner = builder.mix_shaders(DROPS_GO_FORWARD, scattered, through)
     mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.05))
     fresnel = builder.node("ShaderNodeFresnel", IOR=REFRACTIVE_INDEX["water"])
     builder.surface(builder.mix_shaders(fresnel.outputs[0], inner, mirror))

@@ -61,7 +61,8 @@ REFRACTIVE_INDEX: dict[str, float] = {
 """Of every look that light goes into through a smooth surface [-], for yellow light at 20 °C."""
 
 _PALEST = 0.999  # channel of a tint; what absorbs nothing at all would have no node
-_DIGITS = 6  # significant, of a density: the last bits of a root differ from one C library to the next
+_THINNEST = 1.0e-4  # optical depth of a ball; of what is thinner only round-off would be seen
+_DIGITS = 6  # significant, of what is computed: the last bits of a root differ from one C library to the next
 
 
 def _absorption_of(tint: Color, path_m: float, *, darkest: float) -> Color:
@@ -137,6 +138,17 @@ def per_metre(look: str, density: float, color: Color | None = None) -> Color:
     """What a look takes from light, for red, green and blue [1/m]."""
     red, green, blue = INSIDES[look].per_metre(color)
     return density * red, density * green, density * blue
+
+
+def through_ball(look: str, diameter: float, density: float, color: Color | None = None) -> Color:
+    """What white light becomes through a ball of a look [-], of a diameter [m], along straight rays.
+
+    The mean of exp(-absorption chord) over its disc is 2 (1 - (1 + x) exp(-x)) / x², where x is absorption times
+    diameter (van de Hulst 1957, "Light Scattering by Small Particles", 11.23).
+    """
+    depths = (max(_THINNEST, each * diameter) for each in per_metre(look, density, color))
+    red, green, blue = (float(f"{2.0 * (-math.expm1(-x) - x * math.exp(-x)) / (x * x):.{_DIGITS}g}") for x in depths)
+    return red, green, blue
 
 
 def seen_across(look: str) -> Color:

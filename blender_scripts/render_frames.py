@@ -152,7 +152,9 @@ class SceneRenderer:
         self._draw(frame, output_path, master_path)
 
     def save_surfaces(self, frame: int, folder: Path) -> None:
-        """Write the surfaces of fluids as they are drawn at a frame, with where they touch solids: NAME.ply each.
+        """Write the surfaces of fluids at a frame, with where they touch solids: NAME.ply each.
+
+        Drawn they are beside bodies that know what covers them; these are whole there, for scenes whose do not.
 
         Raises as `render` does.
         """
@@ -162,7 +164,8 @@ class SceneRenderer:
             for description, _ in self._sequences
             if description["type"] == "mesh_sequence" and self._is_touched(description)
         ]
-        for description, _, mesh, wetness in self._wetted(frame, self._read_places(frame), sheets):
+        opaque = [touched for touched in self._touched if not self._is_covered(touched[0])]
+        for description, _, mesh, wetness in self._wetted(frame, self._read_places(frame), sheets, opaque):
             write_mesh(folder / f"{description['name']}.ply", replace(mesh, wet=wetness[:, None]))
 
     def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
@@ -237,18 +240,22 @@ class SceneRenderer:
 
     def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[SurfaceMesh]) -> None:
         filled = []
-        for description, blender_object, mesh, wetness in self._wetted(frame, places, sheets):
+        for description, blender_object, mesh, wetness in self._wetted(frame, places, sheets, self._touched):
             geometry.fill_mesh(blender_object.data, mesh, wetness)
             filled.append((description, mesh))
         for vessel in self._vessels:
             vessel.cover(filled, _placed(vessel.touchable, vessel.description, places))
 
     def _wetted(
-        self, frame: int, places: dict[str, poses.Pose], sheets: list[SurfaceMesh]
+        self,
+        frame: int,
+        places: dict[str, poses.Pose],
+        sheets: list[SurfaceMesh],
+        bodies: list[tuple[dict[str, Any], wetting.Touchable]],
     ) -> Iterator[tuple[dict[str, Any], Any, SurfaceMesh, np.ndarray]]:
-        """Every fluid with its surface, and how far each vertex of that touches something."""
+        """Every fluid with its surface, and how far each vertex of that touches the floor, these, or another fluid."""
         solids = [wetting.Touchable.of(sheet, is_closed=False) for sheet in sheets]
-        solids += [_placed(body, description, places) for description, body in self._touched]
+        solids += [_placed(body, description, places) for description, body in bodies]
         surfaces = [_read_surface(self._file(description["file"], frame)) for description, _ in self._fluids]
         for (description, blender_object), surface in zip(self._fluids, surfaces, strict=True):
             # Cycles follows light through one surface on its way to the floor, and not through two that are parallel.

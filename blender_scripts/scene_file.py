@@ -112,6 +112,10 @@ class SceneFile(SceneRenderer):
                     before[blender_object.name] = orientation
                     _key(blender_object, frame + offset, location=position, rotation_quaternion=orientation)
 
+    def _is_covered(self, description: dict[str, Any]) -> bool:  # noqa: ARG002
+        """Never: it is not told of each frame where liquids cover a body, and their surfaces are whole beside it."""
+        return False
+
     def _place_bodies(self, frame: int) -> dict[str, poses.Pose]:
         return self._read_places(frame)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import ceil
+from math import ceil, pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blender_scripts.look_table import LOOK_TABLE
-from blender_scripts.optics import INSIDES
+from blender_scripts.optics import INSIDES, through_ball
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
@@ -81,13 +81,11 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
         material=material,
         wets_within=WETS_WITHIN_RADII * fluid.particle_radius if sees else None,
     )
-    is_clear = material.look is None or LOOK_TABLE[material.look].refracts
-    # Drops of a clear liquid are too small to refract in a picture; those of others look like it.
     yield PointSequenceObject(
         name=f"{fluid.name}.drops",
         file=f"drops/{fluid.name}/{{frame}}.ply",
         kind="spray",
-        material=material_of("drops") if is_clear else material,
+        material=_colored(material_of("drops"), material, job, fluid),
     )
     for kind in WHITEWATER if fluid.name in job.whitewater else ():
         yield PointSequenceObject(
@@ -96,6 +94,21 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
             kind=kind,
             material=material_of(kind),
         )
+
+
+def _colored(
+    drops: MaterialParameters, liquid: MaterialParameters, job: Job, fluid: FluidParameters
+) -> MaterialParameters:
+    """The look `drops` in the colour that light has through a drop of the liquid, unless the job gives it one."""
+    absorbs = liquid.look in INSIDES and LOOK_TABLE[liquid.look].refracts
+    if drops.look != "drops" or drops.color is not None or not absorbs:
+        return drops
+    # A particle is not drawn as more drops than the job allows, but as larger ones.
+    fewest = 2.0 * fluid.particle_radius * (6.0 / (pi * max(1, job.surface.drops_per_particle))) ** (1.0 / 3.0)
+    diameter = max(job.surface.drop_diameter, fewest)
+    assert liquid.look is not None and liquid.density is not None, "materials are as dense as they are drawn"
+    color = through_ball(liquid.look, diameter, liquid.density, liquid.color)
+    return drops.model_copy(update={"color": color})
 
 
 def _in_glass(job: Job) -> bool:

@@ -25,7 +25,7 @@ from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.smoke import SMOKE
 from pipeline.model.boxes import domain_box
 from pipeline.model.job import Job
-from pipeline.model.looks import BODY, POINTS, SOLID
+from pipeline.model.looks import BODY, POINTS, SOLID, WHITEWATER
 from pipeline.model.positions import KeyPath
 from render.camera_path import corners_of_boxes
 from render.parameters import MaterialParameters
@@ -181,9 +181,11 @@ def material_of(job: Job, body: str, part: str = BODY) -> MaterialParameters:
 def described_material(job: Job, body: str, part: str = BODY) -> MaterialParameters:
     """The same with every key that the job file gives, also those that have no effect."""
     usual = _usual_material(job, body, part)
-    if part != BODY and part not in POINTS:
-        of_body = described_material(job, body)
-        usual = usual if of_body.look and LOOK_TABLE[of_body.look].paints_parts else of_body
+    if part != BODY and part not in WHITEWATER:
+        look = (of_body := described_material(job, body)).look
+        # Drops of a clear liquid are too small to refract in a picture; those of others look like it.
+        keeps = (not look or LOOK_TABLE[look].refracts) if part in POINTS else look and LOOK_TABLE[look].paints_parts
+        usual = usual if keeps else of_body
     name = body if part == BODY else f"{body}.{part}"
     said = [material for written, material in job.material.items() if written != name and is_meant(written, name)]
     for material in [*said, job.material.get(name)]:

@@ -78,7 +78,7 @@ class BlendExport(_SceneExport):
     """The scene, and of each frame the fluids as they are drawn; all else it plays are the job's own files."""
 
     format = "blend"
-    version = 1
+    version = 2
     about = "the scene for Blender"
     opened_by = "open {file} in Blender 4.5 LTS or later; it plays the files beside it"
     refers_to = ("surfaces", "cloths", "drops", "whitewater", "volumes")

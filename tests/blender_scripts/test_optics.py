@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from blender_scripts.look_table import LOOK_TABLE
-from blender_scripts.optics import HONEY_TINT, INSIDES, REFRACTIVE_INDEX, per_metre, usual_density
+from blender_scripts.optics import HONEY_TINT, INSIDES, REFRACTIVE_INDEX, per_metre, through_ball, usual_density
 
 LIQUIDS = ("water", "honey", "wine", "oil", "coffee", "ink")
 
@@ -60,3 +60,11 @@ def test_densities_mean_what_they_meant():
     np.testing.assert_allclose(transmitted("water", 1.0, 10.0, (0.5, 0.02, 0.3)), (0.5, 0.02, 0.3))
     np.testing.assert_allclose(transmitted("honey", 0.01, 1.0), HONEY_TINT)
     assert transmitted("smoke", 2.0, 0.5)[0] == pytest.approx(math.exp(-1.0))
+
+
+@pytest.mark.parametrize(("look", "diameter"), [("water", 0.003), ("wine", 0.003), ("coffee", 0.02)])
+def test_light_through_a_ball_is_the_mean_over_its_disc(look, diameter):
+    share = (np.arange(20_000) + 0.5) / 20_000  # of the disc's area
+    chord = diameter * np.sqrt(1.0 - share)
+    expected = [np.exp(-each * chord).mean() for each in per_metre(look, 1.0)]
+    np.testing.assert_allclose(through_ball(look, diameter, 1.0), expected, rtol=1e-4)

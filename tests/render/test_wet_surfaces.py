@@ -10,7 +10,7 @@ from blender_scenes import LUMINANCE, RENDER_FRAMES, draw_all, redness, spec_of,
 from needed_blender import needs_bpy
 from warm_python import run_python
 
-from render.meshes import write_ply
+from render.meshes import read_ply, write_ply
 from render.parameters import CameraParameters, MaterialParameters
 from render.poses import write_poses
 from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, SceneObject
@@ -241,6 +241,37 @@ def test_glass_vanishes_in_a_liquid_of_its_refractive_index(tmp_path):
     # Of 255; glass of 1.50 in honey of 1.49 is a weak lens, its tint and the noise of 4 samples come to the rest.
     assert covered < 0.25 * dry
     assert wide < 0.25 * dry
+
+
+EXPORTED = """
+import sys
+from pathlib import Path
+import bpy
+from blender_scripts.render_frames import SceneRenderer
+from blender_scripts.scene_file import SceneFile
+folder = Path(sys.argv[1])
+spec = folder / "spec.json"
+SceneRenderer(spec, threads=1, gpu=None).save_surfaces(0, folder)
+SceneFile(spec, threads=1, gpu=None)
+nodes = bpy.data.materials["ball"].node_tree.nodes
+print("ASKED", [node.attribute_name for node in nodes if node.type == "ATTRIBUTE"])
+"""
+
+
+@pytest.mark.parametrize(("look", "is_wet"), [("glass", False), ("metal", True)])
+def test_an_exported_scene_has_whole_surfaces_beside_glass_that_is_not_told_of_what_covers_it(tmp_path, look, is_wet):
+    center, radius = BALL
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), radius))
+    write_water(tmp_path, hole=(center, radius + GAP))
+    ball = MeshObject(name="ball", file="ball.ply", position=center, material=MaterialParameters(look=look))
+    spec_of(water(REACH), ball).write(tmp_path / "spec.json")
+    assert "ASKED []" in run_python(EXPORTED, str(tmp_path))
+    surface = read_ply(tmp_path / "water.ply")
+    beside = np.linalg.norm(surface.vertices - center, axis=1) < radius + 1.5 * GAP
+    assert beside.any()
+    assert (surface.wet[beside] > 0.5).all() == is_wet
+    assert (surface.wet[beside] > 0.5).any() == is_wet
+    assert (surface.wet[np.isclose(surface.vertices[:, 2], surface.vertices[:, 2].min())] > 0.5).any()  # on the floor
 
 
 def test_a_surface_without_normals_is_refused(tmp_path):

@@ -13,6 +13,7 @@ from places import HELPERS, PROJECT
 from planned_jobs import LAYOUT, concerned, planned
 from test_whitewater_stage import FRAMES, JOB_FILE, OIL, TANK, write_cache
 
+from blender_scripts.optics import per_metre
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
 from pipeline.model.job import Job
@@ -21,6 +22,7 @@ from pipeline.stages import STAGES
 from pipeline.stages.render_scene import render_spec
 from pipeline.store.cache import read_frame, write_frame
 from render.meshes import read_ply
+from render.parameters import MaterialParameters
 from render.point_clouds import read_point_cloud, validate_point_cloud
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
@@ -63,6 +65,32 @@ def test_drops_of_clear_liquids_have_a_look_of_their_own_and_those_of_others_loo
     objects = {each.name: each for each in render_spec(job(material={"water": {"look": look}}), LAYOUT).objects}
     assert objects["water.drops"].material.look == drawn
     assert objects["water.drops"].file == "drops/water/{frame}.ply"
+
+
+def drawn(name: str, **materials: dict) -> MaterialParameters:
+    return {each.name: each for each in render_spec(job(material=materials), LAYOUT).objects}[name].material
+
+
+def test_drops_of_a_clear_liquid_have_the_colour_of_light_through_one_of_them():
+    wine = drawn("water", water={"look": "wine", "density": 1.0})
+    red, green, blue = drawn("water.drops", water={"look": "wine", "density": 1.0}).color
+    spec, fluid = job(), job().fluid[0]
+    diameter = 2.0 * fluid.particle_radius * (6.0 / np.pi / spec.surface.drops_per_particle) ** (1.0 / 3.0)
+    mean_chord = 2.0 / 3.0 * max(diameter, spec.surface.drop_diameter)
+    thin = np.exp(-mean_chord * np.array(per_metre("wine", wine.density)))
+    assert red == pytest.approx(thin[0], rel=0.02)  # where little is absorbed the chord's mean is all that counts
+    assert green < blue < 0.7 < red
+    own = drawn("water.drops", water={"look": "wine"}, **{"water.drops": {"color": (0.1, 0.2, 0.3)}})
+    assert own.color == (0.1, 0.2, 0.3)
+
+
+def test_drops_of_a_cloudy_liquid_are_as_the_job_says():
+    said = drawn(
+        "water.drops", water={"look": "milk"}, **{"water.drops": {"look": "plastic", "color": (0.1, 0.2, 0.3)}}
+    )
+    assert (said.look, said.color) == ("plastic", (0.1, 0.2, 0.3))
+    rough = drawn("water.drops", water={"look": "milk"}, **{"water.drops": {"roughness": 0.4}})
+    assert (rough.look, rough.roughness) == ("milk", 0.4)
 
 
 # --- run -----------------------------------------------------------------------------------------------------------
