@@ -18,7 +18,7 @@ LARGEST_NUMBER = 1.0e9
 def check_magnitudes(job: Job, findings: Findings) -> bool:
     """Whether every number of the scene is of a size that can be computed with; notes those that are not."""
     ok = True
-    scene = job.model_dump(include={"domain", "gravity", *KINDS, "whitewater"})
+    scene = job.model_dump(include={"domain", "gravity", *KINDS, "whitewater"}, exclude_defaults=True)
     for path, value in _numbers(scene):
         if value == 0.0 or SMALLEST_LENGTH <= abs(value) <= LARGEST_LENGTH:
             continue  # fits whatever the unit; to ask for that, the schema of all jobs is built, which takes a while

@@ -281,7 +281,7 @@ def test_how_finely_spray_is_drawn_concerns_no_surface_by_itself():
         *("smoothing_length_in_radii", "cube_size_in_radii", "threshold"),
         *("mesh_smoothing_iterations", "normals_smoothing_iterations"),
     }
-    assert concerned(job(), job(surface={"drops_per_particle": 10})) == {"spray"}
+    assert concerned(job(), job(surface={"drops_per_particle": 10})) == {"spray", "render"}  # larger drops are darker
 
 
 def test_surfaces_and_volumes_are_counted_in_memory_too():
