@@ -11,9 +11,9 @@ import pytest
 from films import FRAMES, STAGE_NAMES, Finished, Studio, stage_of
 from PIL import Image
 
-FILES = 1 + 6 * FRAMES + 2
-"""The ball's mesh; cache, surface, cloth, whitewater, volume and picture of each frame; segment and film."""
-TASKS = 1 + 1 + 5 * FRAMES + 2  # the same, with one task for all of the cache
+FILES = 1 + 8 * FRAMES + 2
+"""The ball's mesh; cache, kinds, drops, surface, cloth, whitewater, volume and picture of each frame; segment, film."""
+TASKS = 1 + 1 + 6 * FRAMES + 2  # the same, with one task for all of the cache
 
 
 def test_submit_makes_every_file_and_a_film_of_the_right_size_and_length(first_submit: tuple[Studio, Finished]) -> None:
@@ -21,7 +21,7 @@ def test_submit_makes_every_file_and_a_film_of_the_right_size_and_length(first_s
     root = studio.layout.root
     assert submitted.out.startswith(f"renders/tiny/movie.mp4: {FRAMES} frames, 0.1 s of film, in ")
     for stage in STAGE_NAMES:
-        files = {"bodies": 1, "movie": 2}.get(stage, FRAMES)
+        files = {"bodies": 1, "movie": 2, "spray": 2 * FRAMES}.get(stage, FRAMES)
         assert re.search(rf"{stage} (\(.*\) )?{files}/{files}", submitted.err), submitted.err
     assert len(studio.artifacts()) == FILES
     assert set(studio.attempts().values()) == {1}
