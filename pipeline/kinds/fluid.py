@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import ceil, pi
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from render.surface import reconstruct_surface
 from sim.core.snapshots import Snapshot
 from sim.fluid.parameters import FluidParameters
 from sim.shapes.parameters import Placement
+from sim.whitewater.kinds import LiquidKind, drops_of_particle, mean_diameter
 
 if TYPE_CHECKING:
     import h5py
@@ -40,8 +41,6 @@ WETS_WITHIN_RADII = 1.5
 WORKER_BYTES = 100_000_000
 BYTES_PER_SURFACE_PARTICLE = 140_000
 """Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`."""
-SHEET, SPRAY = 1, 2
-"""Values of the array `liquid` (`sim.whitewater.liquid.LiquidKind`), which takes scipy to import."""
 CUBE_SIZE = 0.75
 """In radii. Cubes of half the width need four times the memory."""
 
@@ -103,9 +102,12 @@ def _colored(
     absorbs = liquid.look in INSIDES and LOOK_TABLE[liquid.look].refracts
     if drops.look != "drops" or drops.color is not None or not absorbs:
         return drops
-    # A particle is not drawn as more drops than the job allows, but as larger ones.
-    fewest = 2.0 * fluid.particle_radius * (6.0 / (pi * max(1, job.surface.drops_per_particle))) ** (1.0 / 3.0)
-    diameter = max(job.surface.drop_diameter, fewest)
+    count = drops_of_particle(
+        particle_radius=fluid.particle_radius,
+        diameter=job.surface.drop_diameter,
+        most=max(1, job.surface.drops_per_particle),
+    )
+    diameter = mean_diameter(particle_radius=fluid.particle_radius, count=count)
     assert liquid.look is not None and liquid.density is not None, "materials are as dense as they are drawn"
     color = through_ball(liquid.look, diameter, liquid.density, liquid.color)
     return drops.model_copy(update={"color": color})
@@ -143,14 +145,14 @@ def _surface_memory(job: Job, fluid: FluidParameters) -> int:
 
 
 def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
-    meshed = fluid.arrays["liquid"] != SPRAY
+    meshed = fluid.arrays["liquid"] != LiquidKind.SPRAY
     radius = fluid.number("particle_radius")
     surface = reconstruct_surface(
         fluid.arrays["position"][meshed],
         fluid.arrays["velocity"][meshed],
         particle_radius=radius,
         parameters=job.surface,
-        is_thin=fluid.arrays["liquid"][meshed] == SHEET,
+        is_thin=fluid.arrays["liquid"][meshed] == LiquidKind.SHEET,
         volume=len(meshed) * (2.0 * radius) ** 3 - fluid.number("volume_of_drops"),
         threads=threads,
     )

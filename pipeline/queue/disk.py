@@ -1,6 +1,5 @@
 """Disk space: how much a job will take, and how much of it stays free."""
 
-import math
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ from pipeline.base import wording
 from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
+from sim.whitewater.kinds import drops_of_particle
 
 RESERVE_BYTES = 2 * 2**30
 """Free space at which a job pauses: a checkpoint of a large simulation and a few frames fit."""
@@ -59,10 +59,10 @@ def size_of(job: Job, findings: Findings) -> Size:
 
 
 def _drops_per_particle(job: Job) -> float:
-    """At most: as many balls of the mean diameter as the largest particle has volume for, if the job allows them."""
-    ball = math.pi / 6.0 * job.surface.drop_diameter**3
-    largest = max((fluid.lattice_volume for fluid in job.fluid), default=0.0)
-    return min(job.surface.drops_per_particle, math.ceil(largest / ball))
+    """Of the largest particles."""
+    largest = max((fluid.particle_radius for fluid in job.fluid), default=0.0)
+    diameter, most = job.surface.drop_diameter, job.surface.drops_per_particle
+    return drops_of_particle(particle_radius=largest, diameter=diameter, most=most)
 
 
 def _picture_bytes_per_pixel(job: Job) -> float:

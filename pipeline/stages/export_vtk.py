@@ -121,9 +121,11 @@ class _Frame:
             yield body.name, partial(of_form[kind.display.form], body=body)
             if kind.name == "fluid":
                 yield f"{body.name}.surface", partial(self._surface, name=body.name)
-                yield f"{body.name}.drops", partial(self._drops, name=body.name)
+                drops = self._layout.drops(body.name, self._frame)
+                yield f"{body.name}.drops", partial(self._cloud, file=drops, fades=False)
             if body.name in self._job.whitewater:
-                yield f"{body.name}.whitewater", partial(self._whitewater, name=body.name)
+                whitewater = self._layout.whitewater(body.name, self._frame)
+                yield f"{body.name}.whitewater", partial(self._cloud, file=whitewater, fades=True)
 
     def _points(self, path: Path, *, body: Any) -> None:
         snapshot = read_compact(self._cache, body.name)
@@ -192,17 +194,9 @@ class _Frame:
         }
         write_polydata(path, mesh.vertices, triangles=mesh.faces, point_values=values, time_s=self._time_s)
 
-    def _drops(self, path: Path, *, name: str) -> None:
-        cloud = read_point_cloud(self._layout.path(self._layout.drops(name, self._frame)))
+    def _cloud(self, path: Path, *, file: ArtifactPath, fades: bool) -> None:
+        cloud = read_point_cloud(self._layout.path(file))
         values = {"velocity": Values(cloud.velocity, "m/s"), "radius": Values(cloud.radius, "m")}
-        write_polydata(path, cloud.position, point_values=values, time_s=self._time_s)
-
-    def _whitewater(self, path: Path, *, name: str) -> None:
-        cloud = read_point_cloud(self._layout.path(self._layout.whitewater(name, self._frame)))
-        values = {
-            "velocity": Values(cloud.velocity, "m/s"),
-            "radius": Values(cloud.radius, "m"),
-            "lifetime": Values(cloud.lifetime, "s"),
-            "kind": Values(cloud.kind, "1"),
-        }
+        if fades:
+            values |= {"lifetime": Values(cloud.lifetime, "s"), "kind": Values(cloud.kind, "1")}
         write_polydata(path, cloud.position, point_values=values, time_s=self._time_s)

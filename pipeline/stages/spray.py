@@ -26,6 +26,7 @@ from sim.core.runtime import initialize
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
 from sim.fluid.parameters import FluidParameters
+from sim.whitewater.kinds import LiquidKind, drops_of_particle
 
 if TYPE_CHECKING:
     from sim.whitewater.drops import Drops
@@ -87,7 +88,6 @@ class SprayStage(Stage):
         task, job, layout = context.task, context.job, context.layout
         assert task.frame is not None
         initialize("cpu", threads=context.threads)
-        from sim.whitewater.liquid import LiquidKind
 
         bodies = read_fluids_and_bodies(layout.path(task.inputs[0]))
         solids = _solids(job, bodies, bodies[task.subject].number("particle_radius"))
@@ -171,8 +171,7 @@ def _drops(
     job: Job, bodies: Mapping[str, Snapshot], name: str, state: LiquidState, solids: Obstacles
 ) -> tuple[Drops, float]:
     """The drops of a fluid's spray that are neither in the liquid nor in walls and bodies; what has left [m³]."""
-    from sim.whitewater.drops import Drops, drops_of, drops_of_particle, in_the_air
-    from sim.whitewater.liquid import LiquidKind
+    from sim.whitewater.drops import Drops, drops_of, in_the_air
     from sim.whitewater.motion import FluidState
 
     fluid, particle_radius = FluidState.of_snapshots([bodies[name]]), bodies[name].number("particle_radius")

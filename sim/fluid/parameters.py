@@ -17,19 +17,7 @@ from sim.core.motion.parameters import (
 from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.fluid.inflow import Inflow
 from sim.fluid.traits import CFL_NUMBER, TRAITS, VISCOUS_NUMBER
-from sim.shapes.parameters import (
-    BoxShape,
-    BunnyShape,
-    CapsuleShape,
-    ConeShape,
-    CylinderShape,
-    DuckShape,
-    MeshShape,
-    Placement,
-    RevolvedShape,
-    SphereShape,
-    TorusShape,
-)
+from sim.shapes.parameters import Placement, Shape
 
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
 
@@ -58,20 +46,7 @@ class RectangleOpening(Parameters):
     size: tuple[Positive, Positive] = Field(description="Lengths of its sides [m].")
 
 
-OpeningShape = (
-    DiscOpening
-    | RectangleOpening
-    | BoxShape
-    | SphereShape
-    | CylinderShape
-    | CapsuleShape
-    | TorusShape
-    | ConeShape
-    | RevolvedShape
-    | DuckShape
-    | BunnyShape
-    | MeshShape
-)
+OpeningShape = DiscOpening | RectangleOpening | Shape
 
 
 class EmitterParameters(Parameters):

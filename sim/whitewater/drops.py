@@ -1,8 +1,8 @@
 """The drops that a spray particle stands for: many, of different sizes, as much liquid as the particle in all.
 
-Sheets and ligaments break into drops whose diameters follow a Gamma distribution (Villermaux 2007, "Fragmentation",
-eq. 22; its order n is 4 to 5 for ligaments as rough as those of splashes), about as large as the capillary length. A
-drop has the same size and the same place about its particle in every frame: random numbers are keyed by both.
+Sheets and ligaments break into drops whose diameters follow a Gamma distribution (`sim.whitewater.kinds`), about as
+large as the capillary length. A drop has the same size and the same place about its particle in every frame: random
+numbers are keyed by both.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from scipy.special import gammaincinv
 
 from sim.core.drag import TENSION_OF_WATER
 from sim.core.hashed_numbers import uniforms
-from sim.whitewater.liquid import LiquidKind, LiquidState
+from sim.whitewater.kinds import GAMMA_ORDER, LiquidKind
+from sim.whitewater.liquid import LiquidState
 from sim.whitewater.motion import FluidState
-
-GAMMA_ORDER = 4.0
 
 STIFF = 0.1
 """Ohnesorge number nu rho / sqrt(rho sigma d) above which viscosity keeps a drop of diameter d from breaking up
@@ -61,14 +60,6 @@ def atomizes(*, viscosity: float, rest_density: float, particle_radius: float) -
     return viscosity * math.sqrt(rest_density / (TENSION_OF_WATER * diameter)) < STIFF
 
 
-def drops_of_particle(*, particle_radius: float, diameter: float, most: int) -> int:
-    """Number of drops of one particle, of this mean diameter [m] where there are not more than `most`; at least 1."""
-    order = GAMMA_ORDER
-    # Mean of the cube of a Gamma distribution over the cube of its mean.
-    mean_volume = math.pi / 6.0 * diameter**3 * (order + 1.0) * (order + 2.0) / order**2
-    return max(1, min(most, round((2.0 * particle_radius) ** 3 / mean_volume)))
-
-
 def spread(state: LiquidState, fluid: FluidState, *, particle_radius: float, dt: float) -> LiquidState:
     """The state with the reach of spray grown over a frame of dt [s], in the speed of its particle."""
     is_spray = state.kind == LiquidKind.SPRAY
@@ -88,14 +79,14 @@ def drops_of(state: LiquidState, fluid: FluidState, *, particle_radius: float, c
     ids = np.repeat(state.particle_id[rows], count)
     number = np.tile(np.arange(count), len(rows))
     size, height, turn, depth = uniforms((ids, number, 0, 0), (0, 0))
-    diameters = gammaincinv(GAMMA_ORDER, size).reshape(-1, count)
+    diameters = gammaincinv(GAMMA_ORDER, size).reshape(len(rows), count)
     volume = (2.0 * particle_radius) ** 3
     radii = diameters * np.cbrt(volume / (4.0 / 3.0 * math.pi * (diameters**3).sum(axis=1, keepdims=True)))
 
     z = 2.0 * height - 1.0
     across = np.sqrt(1.0 - z * z)
     place = np.stack([across * np.cos(2.0 * math.pi * turn), across * np.sin(2.0 * math.pi * turn), z], axis=1)
-    place = (place * np.cbrt(depth)[:, None]).reshape(-1, count, 3)
+    place = (place * np.cbrt(depth)[:, None]).reshape(len(rows), count, 3)
     # The middle of a particle's drops is the particle.
     place -= ((radii**3)[..., None] * place).sum(axis=1, keepdims=True) / (radii**3).sum(axis=1)[:, None, None]
 

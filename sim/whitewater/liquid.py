@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sim.whitewater.fluid_field import SUPPORT_IN_SPACINGS, FluidField
+from sim.whitewater.kinds import LiquidKind
 from sim.whitewater.motion import FluidState
 from sim.whitewater.obstacles import Obstacles
 
@@ -45,14 +45,6 @@ FLAT, STAYING_FLAT = 0.1, 0.2
 KEPT_FRAMES = 4
 """For so many frames a kind is kept, but where spray falls into the crowd: so only what will not be there so soon, as
 it flies, becomes spray."""
-
-
-class LiquidKind(IntEnum):
-    """What a particle of a fluid stands for."""
-
-    BULK = 0
-    SHEET = 1  # sheets, films and threads one particle thick
-    SPRAY = 2  # drops that are smaller than it
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from render.parameters import MaterialParameters
 from render.point_clouds import read_point_cloud, validate_point_cloud
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
+from sim.whitewater.kinds import LiquidKind
 
 RADIUS = 0.01
 
@@ -75,8 +76,10 @@ def test_drops_of_a_clear_liquid_have_the_colour_of_light_through_one_of_them():
     wine = drawn("water", water={"look": "wine", "density": 1.0})
     red, green, blue = drawn("water.drops", water={"look": "wine", "density": 1.0}).color
     spec, fluid = job(), job().fluid[0]
-    diameter = 2.0 * fluid.particle_radius * (6.0 / np.pi / spec.surface.drops_per_particle) ** (1.0 / 3.0)
-    mean_chord = 2.0 / 3.0 * max(diameter, spec.surface.drop_diameter)
+    # As many drops as a particle may have, <d³> = 1.875 <d>³ of each.
+    diameter = 2.0 * fluid.particle_radius * (6.0 / np.pi / 1.875 / spec.surface.drops_per_particle) ** (1.0 / 3.0)
+    assert diameter > spec.surface.drop_diameter
+    mean_chord = 2.0 / 3.0 * diameter
     thin = np.exp(-mean_chord * np.array(per_metre("wine", wine.density)))
     assert red == pytest.approx(thin[0], rel=0.02)  # where little is absorbed the chord's mean is all that counts
     assert green < blue < 0.7 < red
@@ -189,9 +192,9 @@ def test_lone_particles_are_drops_outside_of_the_ball_and_in_no_mesh(splash):
         assert np.linalg.norm(cloud.position - [0.0, 0.0, 0.2], axis=1).min() > 0.1 - 1e-3
         assert cloud.radius.max() < RADIUS
     kinds = read_frame(splash.path(splash.liquid("water", 7)), "water").bodies["water"].arrays["liquid"]
-    assert (kinds[-40:] == 2).sum() > 35
-    assert (kinds[:500] == 2).sum() == 0
-    assert (kinds[500:-40] == 1).sum() > 30
+    assert (kinds[-40:] == LiquidKind.SPRAY).sum() > 35
+    assert (kinds[:500] == LiquidKind.SPRAY).sum() == 0
+    assert (kinds[500:-40] == LiquidKind.SHEET).sum() > 30
     mesh = read_ply(splash.path(splash.surface("water", 7)))
     assert mesh.vertices[:, 2].max() < 0.4
 
@@ -237,4 +240,4 @@ def test_a_piece_that_another_fluid_surrounds_is_no_spray(is_alone, tmp_path):
     write_frame(path, bodies, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
     assert run_in_a_process(layout, ["spray/oil/000000"]).count("Finished") == 1
     kinds = read_frame(layout.path(layout.liquid("oil", 0)), "oil").bodies["oil"].arrays["liquid"]
-    assert (kinds == 2).tolist() == [is_alone] * 8
+    assert (kinds == LiquidKind.SPRAY).tolist() == [is_alone] * 8

@@ -9,16 +9,15 @@ import pytest
 from scipy import stats
 
 from sim.whitewater.drops import (
-    GAMMA_ORDER,
     LARGEST_REACH_IN_RADII,
     Drops,
     atomizes,
     drops_of,
-    drops_of_particle,
     in_the_air,
     spread,
 )
-from sim.whitewater.liquid import LiquidKind, LiquidState
+from sim.whitewater.kinds import GAMMA_ORDER, LiquidKind, drops_of_particle, mean_diameter
+from sim.whitewater.liquid import LiquidState
 from sim.whitewater.motion import FluidState
 
 RADIUS = 0.005
@@ -68,6 +67,7 @@ def test_the_number_of_drops_gives_the_mean_diameter():
         count = drops_of_particle(particle_radius=RADIUS, diameter=diameter, most=100_000)
         mean_volume = math.pi / 6.0 * 1.875 * diameter**3
         assert count == pytest.approx((2.0 * RADIUS) ** 3 / mean_volume, abs=0.5)
+        assert mean_diameter(particle_radius=RADIUS, count=count) == pytest.approx(diameter, rel=0.2 / count)
     assert drops_of_particle(particle_radius=RADIUS, diameter=1e-3, most=24) == 24
     assert drops_of_particle(particle_radius=1e-4, diameter=2.7e-3, most=24) == 1
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sim.core.domain import DomainParameters
-from sim.whitewater.liquid import CROWDED, KEPT_FRAMES, LiquidKind, LiquidState, lie_on, next_liquid
+from sim.whitewater.kinds import LiquidKind
+from sim.whitewater.liquid import CROWDED, KEPT_FRAMES, LiquidState, lie_on, next_liquid
 from sim.whitewater.motion import FluidState
 from sim.whitewater.obstacles import Obstacles
 
