@@ -38,20 +38,27 @@ class DFSPHSolver(IncompressibleFluid):
     (`sim.fluid.pressure.momentum`). And of a compression that a particle has already, from walls or the error of
     linearization, a step takes back a part only (`IncompressibleFluid.correction`), as it turns into speed.
 
-    Momentum of fluid pairs is conserved to rounding. The `pressure_term` is that of the density solve;
-    the divergence solve adds impulses that are small but where fluid hits something.
+    Momentum of fluid pairs is conserved to rounding. The `pressure_term` is the sum of both pressures, as both act for
+    the whole step: what hits something has much of it from the divergence solve.
 
     Attributes:
         least_density: below which a particle has no divergence [-].
     """
 
+    carried = (*IncompressibleFluid.carried, "divergence_pressure")
     solved_for = ("density", "divergence")
 
     def __init__(self, start: FluidStart) -> None:
         """Take particles, walls and bodies."""
         super().__init__(start)
-        self._divergence_pressure = ti.ndarray(ti.f32, self.particles.capacity)
         self.least_density = 1.0 - AT_SURFACE * (1.0 - surface_density(self.discretization.support_in_spacings))
+
+    @property
+    def pressure_term(self) -> ti.Ndarray:
+        """P_i of both solves of each particle [Pa], until the next step."""
+        carried = self.particles.carried
+        add_pressures(carried["pressure"], carried["divergence_pressure"], self.particles.count, self.next_pressure)
+        return self.next_pressure
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
@@ -65,7 +72,8 @@ class DFSPHSolver(IncompressibleFluid):
 
     def correct_divergence_error(self, dt: float) -> None:
         """Make the velocities free of divergence, for a step of dt [s]."""
-        pressure, tolerance = self._divergence_pressure, self.parameters.divergence_tolerance
+        carried, tolerance = self.particles.carried, self.parameters.divergence_tolerance
+        pressure = carried["divergence_pressure"]
         self.forces.recoil_sheets(DIVERGENCE, dt)
         compute_divergence(self.tank.on_device, self.system, dt, self.least_density, pressure)
         error = self.mean_error(pressure, 0.0, self.system.compression)
@@ -76,7 +84,7 @@ class DFSPHSolver(IncompressibleFluid):
             record.add(least, error, converged=True)
         else:
             pressure = self.solve(record, pressure, dt, least=least, tolerance=tolerance)
-        self._divergence_pressure = pressure
+        carried["divergence_pressure"] = pressure
         self.forces.react(pressure, dt)
         add_scaled(self.particles.velocity, self.pressure_acceleration, dt, self.particles.count)
 
@@ -101,6 +109,13 @@ def surface_density(support_in_spacings: float) -> float:
     offsets = lattice_offsets(support_in_spacings)
     distances = np.linalg.norm(offsets[offsets[:, 2] <= 0.0], axis=1)
     return particle_volume(1.0, support_in_spacings) * float(evaluate(distances, support_in_spacings).sum())
+
+
+@kernel
+def add_pressures(density_pressure: Floats, divergence_pressure: Floats, count: ti.i32, total: Floats):
+    """P_i of both solves."""
+    for i in range(count):
+        total[i] = density_pressure[i] + divergence_pressure[i]
 
 
 @kernel

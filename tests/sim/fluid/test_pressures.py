@@ -6,6 +6,7 @@ from small_fluids import lattice, make_fluid, run
 
 from sim.core.domain import DomainParameters
 from sim.fluid.kernels import evaluate_slope, lattice_offsets, particle_volume
+from validation.scenes import wall_forces
 
 HEIGHT = 0.2
 
@@ -77,3 +78,26 @@ def test_a_lattice_under_even_pressure_has_it_everywhere(taichi_cpu):
     np.testing.assert_allclose(arrays["pressure"][layer > 2.0], carried, rtol=1.0e-5)  # float32 sums
     # Beside walls, in edges and in corners some bonds along the wall lack; with none of the wall it would be 0.66.
     np.testing.assert_allclose(arrays["pressure"][layer < 2.0], carried, rtol=0.05)
+
+
+@pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])
+def test_the_pressures_of_what_hits_a_wall_are_its_loss_of_momentum(taichi_cpu, solver):
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.4, 0.12, 0.4), open_faces=("z+",))
+    block = lattice((0.1, 0.0, 0.1), (0.38, 0.12, 0.2), 0.02)
+    fluid = make_fluid(
+        domain,
+        block,
+        solver=solver,
+        cfl=0.1,  # pressures are those before a step, distances to walls those after it
+        gravity=(0.0, 0.0, 0.0),
+        velocities=np.full_like(block, [2.0, 0.0, 0.0]),
+    )
+    start, elapsed_s, impulse = fluid.diagnostics()["momentum_x"], 0.0, 0.0
+    while elapsed_s < 0.05:
+        dt = fluid.stable_dt()
+        fluid.substep(dt)
+        elapsed_s += dt
+        impulse += dt * wall_forces(fluid)[1][:, 0].sum()
+    lost = start - fluid.diagnostics()["momentum_x"]
+    assert lost > 0.2 * start
+    assert impulse == pytest.approx(lost, rel=0.05)
