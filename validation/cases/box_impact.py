@@ -25,6 +25,7 @@ HEIGHTS = (0.021, 0.061, 0.101, 0.141)  # of the sensors [m]
 PATCH = 0.04, 0.2  # height and width of what counts as a sensor: a few particles, in the plane part of the flow [m]
 ARRIVAL = 1000.0  # pressure from which on water has reached a sensor [Pa]
 FIRST, CUT = 0.36, 0.0025  # from when on, and how often, pressures are taken [s]
+MEAN_OF = 4  # samples of the running mean that is drawn
 COMPARED = (0.06, 0.28)  # span after the first contact in which they are averaged [s]
 
 
@@ -116,7 +117,7 @@ def find(solver: str, spacing: Sequence[float], end: float) -> Found:
 
 
 def draw(results: Sequence[CaseResult]) -> Figure:
-    """The four pressures over the time since the first contact."""
+    """The four pressures over the time since the first contact, means of 10 ms."""
     figure, panels = make_panels(4)
     record = measured()
     for sensor, (axes, height) in enumerate(zip(panels, HEIGHTS, strict=True), start=1):
@@ -125,7 +126,8 @@ def draw(results: Sequence[CaseResult]) -> Figure:
             times, *pressures = (np.array(result.series[f"{name}_{min(result.series['spacing']):g}"])
                                  for name in ("times", "P1", "P2", "P3", "P4"))  # fmt: skip
             since = times - arrivals(np.stack([times, *pressures], axis=1))[0]
-            axes.plot(since, pressures[sensor - 1] / 1000.0, linewidth=0.8, **style_of(result))
+            mean = np.convolve(pressures[sensor - 1], np.full(MEAN_OF, 1.0 / MEAN_OF), mode="same")
+            axes.plot(since, mean / 1000.0, linewidth=0.8, **style_of(result))
         label_axes(axes, "time since the first contact [s]", "pressure [kPa]", f"{height:g} m above the floor")
     return figure
 

@@ -84,8 +84,8 @@ def find(solver: str, layers: Sequence[int]) -> Found:
               "a third of a spacing at the coarsest"),
         Check("force on the wall over rho U² a", finest["force"], expected, 0.12,
               "the speed's error, and that of the momentum that has not arrived yet"),
-        Check("rms error of the pressure on the wall over rho U²/2", float(np.sqrt((error**2).mean())), 0.0, 0.2,
-              "the foot, where a particle feels floor and wall at once, weighs most"),
+        Check("rms error of the pressure on the wall over rho U²/2", float(np.sqrt((error**2).mean())), 0.0, 0.25,
+              "still water fills the corner, most where artificial viscosity is largest"),
     ]  # fmt: skip
     return checks, {"layers": list(layers), "heights": middles.tolist()} | {
         f"pressure_{count}": each["pressure"] for count, each in zip(layers, runs, strict=True)
