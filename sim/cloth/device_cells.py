@@ -32,6 +32,7 @@ class DeviceCells:
         arity: nodes of a cell.
         count: number of cells.
         law: as `Cells.law` has it, (count, 4).
+        is_damped: whether any of them is.
         cloths: numbers of the cloths that they belong to.
         first_colours: first colour of each group of `COLOURS_AT_ONCE`; the last group may have empty ones.
         mesh: nodes of triangles; nothing of rectangles.
@@ -45,6 +46,7 @@ class DeviceCells:
         self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
+        self.is_damped = False
         self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
         self.multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
         nodes, along, across = (ti.ndarray(kind, self.count * self.arity) for kind in (ti.i32, ti.f32, ti.f32))
@@ -54,16 +56,12 @@ class DeviceCells:
         self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
         self.on_device = CellArrays(nodes, along, across, ti.Vector.ndarray(4, ti.f32, self.count))
 
-    @property
-    def is_damped(self) -> bool:
-        """Whether any of them is."""
-        return bool((self.law[:, :2] * self.law[:, 3:]).any())
-
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
         for number, cloth in enumerate(cloths):
             own = self._cloth_of == number
             self.law[own] = self.host.law(cloth)[own]
+        self.is_damped = bool((self.law[:, :2] * self.law[:, 3:]).any())
         self.on_device.law.from_numpy(self.law.astype(np.float32))
         if self.arity == TRIANGLE:
             nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)

@@ -2,14 +2,15 @@
 
 Taichi looks at every argument of every call several times. `FastKernel` has Taichi check the types of a call once, and
 hands the arguments of later calls with the same types straight to the runtime, but for fields of bundles that the
-kernel does not read. Most calls come again with the same arrays, which are known by then: on a GPU with what they are
-to the runtime, on a CPU with the whole context of the launch.
+kernel does not read. Most calls come again with the same arrays, for which the whole context of the launch is kept on
+CPUs and with CUDA, and on other GPUs what the arrays are to the runtime.
 Measurements: docs/performance.md.
 
 This relies on Taichi's internals, as `sim.core.bundles`, `sim.core.runtime` and `sim.core.reductions` do; the lock file
 pins the release that they belong to.
 """
 
+import ctypes
 import functools
 import operator
 import time
@@ -33,6 +34,8 @@ _tell_compiled: list[Callable[[str, float], None]] = []
 
 MOST_LAUNCHES = 256  # most combinations of arrays whose launch context a kernel keeps
 
+ADDRESS_OF_ARRAY = 1  # place of an array's address among what a kernel gets of it, after its shape
+
 
 def on_compiled(tell: Callable[[str, float], None] | None) -> None:
     """Have `tell(name, seconds)` called after every kernel that had to be compiled in this process; None: nobody."""
@@ -44,10 +47,39 @@ class _Launch(NamedTuple):
 
     compiled: Any
     make_context: Callable[[], Any]
-    context: Any  # on a CPU
+    context: Any  # on a CPU, and with CUDA
+    buffers: "_HostBuffers | None"  # of that context, with CUDA
     numbers: list[Any]  # what that context has, by argument
-    handles: list[tuple[tuple[int], Any]]  # of the arrays, by place; on a GPU
+    handles: list[tuple[tuple[int], Any]]  # of the arrays, by place; on other GPUs
     arrays: tuple[weakref.ref[Any], ...]
+
+
+class _HostBuffers:
+    """Where a launch context has its arguments and its result in the host's memory.
+
+    A launch with CUDA writes into the context where the device's copies of both are, which are gone after it.
+
+    Raises:
+        RuntimeError: a context looks otherwise in memory than that of Taichi 1.7.4.
+    """
+
+    def __init__(self, context: Any) -> None:
+        # pybind11 has the address of an object behind the head of its Python object. A context begins with those of
+        # its kernel, of what kernels read (owned, and again), and of its two buffers.
+        read, written, arguments, result = (_word(_word(id(context) + 16).value + 8 * place) for place in (1, 2, 3, 4))
+        self._arguments, self._result = _word(written.value), _word(written.value + 24)
+        self._addresses = arguments.value, result.value
+        if read.value != written.value or (self._arguments.value, self._result.value) != self._addresses:
+            raise RuntimeError("a launch context of Taichi has another layout than that of release 1.7.4")
+
+    def restore(self) -> None:
+        """Have the context know them again."""
+        self._arguments.value, self._result.value = self._addresses
+
+
+def _word(address: int) -> ctypes.c_uint64:
+    """Eight bytes of the memory of this process."""
+    return ctypes.c_uint64.from_address(address)
 
 
 def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: object) -> None:
@@ -81,7 +113,7 @@ class FastKernel:
         self._program: Any = None
         self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
         self._launches: dict[tuple[Any, ...], _Launch] = {}
-        self._on_cpu = False
+        self._on_cpu = self._on_cuda = False
         self._sort_arguments()
 
     def __call__(self, *args: Any) -> Any:
@@ -89,7 +121,8 @@ class FastKernel:
         program = impl.get_runtime().prog
         if program is not self._program:
             self._program, self._compiled, self._launches = program, {}, {}
-            self._on_cpu = impl.current_cfg().arch in (ti.x64, ti.arm64)
+            arch = impl.current_cfg().arch
+            self._on_cpu, self._on_cuda = arch in (ti.x64, ti.arm64), arch == ti.cuda
         used = self._used(args) if self._has_bundles else args
         arrays = [used[index] for index, _ in self._arrays]
         key = (*[used[index] for index in self._templates], *map(id, arrays))
@@ -99,7 +132,9 @@ class FastKernel:
             if compiled is None:
                 return self._first_call(program, args)
             launch = self._launches[key] = self._kept(program, key, compiled, arrays, len(used))
-        if self._on_cpu:
+        if launch.context is not None:
+            if launch.buffers is not None:
+                launch.buffers.restore()
             return self._launch(program, launch.compiled, launch.context, used, launch.numbers)
         context = launch.make_context()  # it does not outlive the launch
         for place, handle in launch.handles:
@@ -112,23 +147,29 @@ class FastKernel:
         """What is worth keeping of a launch.
 
         On a CPU arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in
-        every launch.
+        every launch. With CUDA it looks at no arrays of which it has no size; addresses are put where it would have them.
         """
         kernel, executable = compiled
-        context, handles = None, []
-        if self._on_cpu:
+        context, buffers, handles = None, None, []
+        if self._on_cpu or self._on_cuda:
             context = kernel.make_launch_context()
             for (_, place), array in zip(self._arrays, arrays, strict=True):
-                size = array.arr.nelement() * array.arr.element_size()
                 address = program.get_ndarray_data_ptr_as_int(array.arr)
-                context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
+                if self._on_cpu:
+                    size = array.arr.nelement() * array.arr.element_size()
+                    context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
+                    continue
+                context.set_struct_arg_uint((*place, ADDRESS_OF_ARRAY), address)
+                for axis, length in enumerate(array.shape):
+                    context.set_struct_arg_int((*place, 0, axis), length)
+            buffers = _HostBuffers(context) if self._on_cuda else None
         else:
             handles = [(place, array.arr) for (_, place), array in zip(self._arrays, arrays, strict=True)]
         if len(self._launches) >= MOST_LAUNCHES:
             self._launches.clear()
         forget = functools.partial(_forget, self._launches, key)
         references = tuple(weakref.ref(array, forget) for array in arrays)
-        return _Launch(executable, kernel.make_launch_context, context, [None] * used, handles, references)
+        return _Launch(executable, kernel.make_launch_context, context, buffers, [None] * used, handles, references)
 
     def _used(self, args: tuple[Any, ...]) -> list[Any]:
         """Arguments that the kernel reads, fields of bundles among them. Raises TypeError where a bundle is another."""
