@@ -15,7 +15,8 @@ import functools
 import operator
 import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections import namedtuple
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import taichi as ti
@@ -87,12 +88,26 @@ def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: o
     launches.pop(key, None)
 
 
-def _getter(paths: list[str]) -> Callable[[Any], Iterable[Any]]:
-    """A function that returns the values at dotted paths in a bundle, in order."""
-    if len(paths) > 1:
-        return operator.attrgetter(*paths)
-    get = operator.attrgetter(*paths)
-    return lambda value: (get(value),)
+def _picker(read: Sequence[str], count: int) -> Callable[[Sequence[Any]], Sequence[Any]]:
+    """A function of `count` arguments that returns what a kernel reads of them, in order.
+
+    Args:
+        read: its paths, as "argument_2.field".
+        count: of the arguments.
+    """
+    if list(read) == [_name_of(number) for number in range(count)]:
+        return lambda arguments: arguments
+    arguments_of: Any = namedtuple("Arguments", [_name_of(number) for number in range(count)])
+    if len(read) > 1:
+        get = operator.attrgetter(*read)
+        return lambda arguments: get(arguments_of(*arguments))
+    getters = [operator.attrgetter(path) for path in read]
+    return lambda arguments: [get(arguments_of(*arguments)) for get in getters]
+
+
+def _name_of(number: int, field: str = "") -> str:
+    """Path of an argument, or of a field of it."""
+    return f"argument_{number}.{field}" if field else f"argument_{number}"
 
 
 class FastKernel:
@@ -108,7 +123,6 @@ class FastKernel:
     def __init__(self, kernel: Any) -> None:
         functools.update_wrapper(self, kernel)
         self._primal = kernel._primal
-        self._has_bundles = hasattr(self._primal.func, "__bundles__")
         self._kinds = getattr(self._primal.func, "__bundles__", (None,) * len(self._primal.arguments))
         self._program: Any = None
         self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
@@ -123,7 +137,7 @@ class FastKernel:
             self._program, self._compiled, self._launches = program, {}, {}
             arch = impl.current_cfg().arch
             self._on_cpu, self._on_cuda = arch in (ti.x64, ti.arm64), arch == ti.cuda
-        used = self._used(args) if self._has_bundles else args
+        used = self._used(args)
         arrays = [used[index] for index, _ in self._arrays]
         key = (*[used[index] for index in self._templates], *map(id, arrays))
         launch = self._launches.get(key)
@@ -147,7 +161,7 @@ class FastKernel:
         """What is worth keeping of a launch.
 
         On a CPU arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in
-        every launch. With CUDA it looks at no arrays of which it has no size; addresses are put where it would have them.
+        every launch. With CUDA it does so unless it has no size of them; addresses are put where it would have them.
         """
         kernel, executable = compiled
         context, buffers, handles = None, None, []
@@ -171,17 +185,12 @@ class FastKernel:
         references = tuple(weakref.ref(array, forget) for array in arrays)
         return _Launch(executable, kernel.make_launch_context, context, buffers, [None] * used, handles, references)
 
-    def _used(self, args: tuple[Any, ...]) -> list[Any]:
+    def _used(self, args: tuple[Any, ...]) -> Sequence[Any]:
         """Arguments that the kernel reads, fields of bundles among them. Raises TypeError where a bundle is another."""
-        used: list[Any] = []
-        for value, kind, fields in zip(args, self._kinds, self._fields, strict=True):
-            if kind is None:
-                used.append(value)
-            elif type(value) is not kind:
-                raise TypeError(f"{self.__name__} takes a {kind.__name__}, got a {type(value).__name__}")
-            elif fields is not None:
-                used += fields(value)
-        return used
+        for number, kind in self._bundles:
+            if type(args[number]) is not kind:
+                raise TypeError(f"{self.__name__} takes a {kind.__name__}, got a {type(args[number]).__name__}")
+        return self._pick(args)
 
     def _key(self, used: Sequence[Any]) -> tuple[Any, ...]:
         """What a kernel is compiled for: compile-time values, and the types of arrays."""
@@ -203,7 +212,7 @@ class FastKernel:
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
             self._sort_arguments()
-        self._compiled[self._key(self._used(args) if self._has_bundles else args)] = kernel, compiled
+        self._compiled[self._key(self._used(args))] = kernel, compiled
         return result.to_numpy().tolist() if self._returns_vector else result
 
     def _launch(self, program: Any, compiled: Any, context: Any, used: Sequence[Any], passed: list[Any]) -> Any:
@@ -228,12 +237,12 @@ class FastKernel:
         self._integers: list[tuple[int, tuple[int]]] = []
         self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
         self._integer_vectors: list[tuple[int, list[tuple[int, int]]]] = []
-        self._fields: list[Callable[[Any], Iterable[Any]] | None] = [None] * len(self._kinds)
+        self._bundles = [(number, kind) for number, kind in enumerate(self._kinds) if kind is not None]
+        read: list[str] = []
         arguments = iter(enumerate(self._primal.arguments))
         count = 0
         for number, kind in enumerate(self._kinds):
             paths = [""] if kind is None else list(field_paths(kind))
-            read = []
             for path, (place, argument) in zip(paths, arguments, strict=False):
                 is_template = isinstance(argument.annotation, ti.template)
                 if not (is_template or is_used(self._primal.func, argument.name)):
@@ -242,10 +251,9 @@ class FastKernel:
                     self._templates.append(count)
                 else:
                     self._sort_argument(count, place - len(self._templates), argument.annotation)
-                read.append(path)
+                read.append(_name_of(number, path))
                 count += 1
-            if kind is not None and read:
-                self._fields[number] = _getter(read)
+        self._pick = _picker(read, len(self._kinds))
         self._used_count = len(getattr(self._primal.func, "__used__", ()))
 
     def _sort_argument(self, index: int, place: int, annotation: Any) -> None:
@@ -276,9 +284,15 @@ class FastKernel:
                 context.set_arg_int(place, used[index])
                 passed[index] = used[index]
         for index, places in self._float_vectors:
+            if used[index] is passed[index]:
+                continue
+            passed[index] = used[index] if type(used[index]) is tuple else None  # others may change
             for place, component in zip(places, used[index], strict=True):
                 context.set_struct_arg_float(place, component)
         for index, places in self._integer_vectors:
+            if used[index] is passed[index]:
+                continue
+            passed[index] = used[index] if type(used[index]) is tuple else None
             for place, component in zip(places, used[index], strict=True):
                 context.set_struct_arg_int(place, component)
 
