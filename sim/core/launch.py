@@ -10,14 +10,14 @@ This relies on Taichi's internals, as `sim.core.bundles`, `sim.core.runtime` and
 pins the release that they belong to.
 """
 
-import ctypes
 import functools
 import operator
 import time
 import weakref
 from collections import namedtuple
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import taichi as ti
 from taichi.lang import impl
@@ -26,6 +26,7 @@ from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
 
 from sim.core.bundles import field_paths, flattened, is_used, with_fields_as_arguments
+from sim.core.cuda_launch import Graph, HostBuffers, Task, tasks_of
 
 _REAL_TYPES = frozenset(primitive_types.real_types)
 
@@ -35,6 +36,8 @@ _tell_compiled: list[Callable[[str, float], None]] = []
 
 MOST_LAUNCHES = 256  # most combinations of arrays whose launch context a kernel keeps
 
+LAUNCHES_BEFORE_GRAPH = 2  # with the same arrays: a graph takes as long to make as some launches
+
 ADDRESS_OF_ARRAY = 1  # place of an array's address among what a kernel gets of it, after its shape
 
 
@@ -43,44 +46,20 @@ def on_compiled(tell: Callable[[str, float], None] | None) -> None:
     _tell_compiled[:] = [] if tell is None else [tell]
 
 
-class _Launch(NamedTuple):
+@dataclass(eq=False, slots=True)
+class _Launch:
     """What is kept of a launch with these arrays, until one of them is gone."""
 
     compiled: Any
     make_context: Callable[[], Any]
     context: Any  # on a CPU, and with CUDA
-    buffers: "_HostBuffers | None"  # of that context, with CUDA
     numbers: list[Any]  # what that context has, by argument
     handles: list[tuple[tuple[int], Any]]  # of the arrays, by place; on other GPUs
     arrays: tuple[weakref.ref[Any], ...]
-
-
-class _HostBuffers:
-    """Where a launch context has its arguments and its result in the host's memory.
-
-    A launch with CUDA writes into the context where the device's copies of both are, which are gone after it.
-
-    Raises:
-        RuntimeError: a context looks otherwise in memory than that of Taichi 1.7.4.
-    """
-
-    def __init__(self, context: Any) -> None:
-        # pybind11 has the address of an object behind the head of its Python object. A context begins with those of
-        # its kernel, of what kernels read (owned, and again), and of its two buffers.
-        read, written, arguments, result = (_word(_word(id(context) + 16).value + 8 * place) for place in (1, 2, 3, 4))
-        self._arguments, self._result = _word(written.value), _word(written.value + 24)
-        self._addresses = arguments.value, result.value
-        if read.value != written.value or (self._arguments.value, self._result.value) != self._addresses:
-            raise RuntimeError("a launch context of Taichi has another layout than that of release 1.7.4")
-
-    def restore(self) -> None:
-        """Have the context know them again."""
-        self._arguments.value, self._result.value = self._addresses
-
-
-def _word(address: int) -> ctypes.c_uint64:
-    """Eight bytes of the memory of this process."""
-    return ctypes.c_uint64.from_address(address)
+    tasks: list[Task] | None = None  # with CUDA, where they are known
+    buffers: HostBuffers | None = None  # with CUDA
+    graph: Graph | None = None
+    count: int = 0  # of launches before there is a graph
 
 
 def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: object) -> None:
@@ -125,7 +104,7 @@ class FastKernel:
         self._primal = kernel._primal
         self._kinds = getattr(self._primal.func, "__bundles__", (None,) * len(self._primal.arguments))
         self._program: Any = None
-        self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
+        self._compiled: dict[tuple[Any, ...], tuple[Any, Any, list[Task] | None]] = {}
         self._launches: dict[tuple[Any, ...], _Launch] = {}
         self._on_cpu = self._on_cuda = False
         self._sort_arguments()
@@ -146,24 +125,22 @@ class FastKernel:
             if compiled is None:
                 return self._first_call(program, args)
             launch = self._launches[key] = self._kept(program, key, compiled, arrays, len(used))
-        if launch.context is not None:
-            if launch.buffers is not None:
-                launch.buffers.restore()
-            return self._launch(program, launch.compiled, launch.context, used, launch.numbers)
-        context = launch.make_context()  # it does not outlive the launch
-        for place, handle in launch.handles:
-            context.set_arg_ndarray(place, handle)
-        return self._launch(program, launch.compiled, context, used, [None] * len(used))
+        return self._launch(program, launch, used)
 
     def _kept(
-        self, program: Any, key: tuple[Any, ...], compiled: tuple[Any, Any], arrays: Sequence[Any], used: int
+        self,
+        program: Any,
+        key: tuple[Any, ...],
+        compiled: tuple[Any, Any, list[Task] | None],
+        arrays: Sequence[Any],
+        used: int,
     ) -> _Launch:
         """What is worth keeping of a launch.
 
         On a CPU arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in
         every launch. With CUDA it does so unless it has no size of them; addresses are put where it would have them.
         """
-        kernel, executable = compiled
+        kernel, executable, tasks = compiled
         context, buffers, handles = None, None, []
         if self._on_cpu or self._on_cuda:
             context = kernel.make_launch_context()
@@ -176,14 +153,15 @@ class FastKernel:
                 context.set_struct_arg_uint((*place, ADDRESS_OF_ARRAY), address)
                 for axis, length in enumerate(array.shape):
                     context.set_struct_arg_int((*place, 0, axis), length)
-            buffers = _HostBuffers(context) if self._on_cuda else None
+            buffers = HostBuffers(context) if self._on_cuda else None
         else:
             handles = [(place, array.arr) for (_, place), array in zip(self._arrays, arrays, strict=True)]
         if len(self._launches) >= MOST_LAUNCHES:
             self._launches.clear()
         forget = functools.partial(_forget, self._launches, key)
         references = tuple(weakref.ref(array, forget) for array in arrays)
-        return _Launch(executable, kernel.make_launch_context, context, buffers, [None] * used, handles, references)
+        make_context = kernel.make_launch_context
+        return _Launch(executable, make_context, context, [None] * used, handles, references, tasks, buffers)
 
     def _used(self, args: tuple[Any, ...]) -> Sequence[Any]:
         """Arguments that the kernel reads, fields of bundles among them. Raises TypeError where a bundle is another."""
@@ -208,17 +186,34 @@ class FastKernel:
         if ended - traced > SLOW_S:
             for tell in _tell_compiled:
                 tell(self.__name__, ended - began)
-        result = self._primal(*flat)
+        tasks = None
+        if self._on_cuda:
+            result, tasks = tasks_of(self.__name__, lambda: self._primal(*flat))
+        else:
+            result = self._primal(*flat)
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
             self._sort_arguments()
-        self._compiled[self._key(self._used(args))] = kernel, compiled
+        self._compiled[self._key(self._used(args))] = kernel, compiled, tasks
         return result.to_numpy().tolist() if self._returns_vector else result
 
-    def _launch(self, program: Any, compiled: Any, context: Any, used: Sequence[Any], passed: list[Any]) -> Any:
-        """Launch with arrays that the context has, and these numbers, of which it has those that are `passed`."""
-        self._pass_numbers(context, used, passed)
-        program.launch_kernel(compiled, context)
+    def _launch(self, program: Any, launch: _Launch, used: Sequence[Any]) -> Any:
+        """Launch with arrays that are kept and the numbers among what is `used`."""
+        context, passed = launch.context, launch.numbers
+        if context is None:
+            context, passed = launch.make_context(), [None] * len(used)  # it does not outlive the launch
+            for place, handle in launch.handles:
+                context.set_arg_ndarray(place, handle)
+        elif launch.buffers is not None and launch.graph is None:
+            launch.buffers.restore()
+            if launch.tasks is not None and launch.count >= LAUNCHES_BEFORE_GRAPH:
+                launch.graph = Graph(launch.tasks, launch.buffers)
+            launch.count += 1
+        is_changed = self._pass_numbers(context, used, passed)
+        if launch.graph is None:
+            program.launch_kernel(launch.compiled, context)
+        else:
+            launch.graph.launch(is_changed=is_changed)
         if self._primal.return_type is None:
             return None
         if not self._on_cpu:
@@ -273,28 +268,28 @@ class FastKernel:
     def _returns_vector(self) -> bool:
         return self._primal.return_type is not None and isinstance(self._primal.return_type[0], VectorType)
 
-    def _pass_numbers(self, context: Any, used: Sequence[Any], passed: list[Any]) -> None:
-        """Numbers that are the same objects as those passed before are there already."""
-        for index, place in self._floats:
-            if used[index] is not passed[index]:
-                context.set_arg_float(place, used[index])
-                passed[index] = used[index]
-        for index, place in self._integers:
-            if used[index] is not passed[index]:
-                context.set_arg_int(place, used[index])
-                passed[index] = used[index]
-        for index, places in self._float_vectors:
-            if used[index] is passed[index]:
-                continue
-            passed[index] = used[index] if type(used[index]) is tuple else None  # others may change
-            for place, component in zip(places, used[index], strict=True):
-                context.set_struct_arg_float(place, component)
-        for index, places in self._integer_vectors:
-            if used[index] is passed[index]:
-                continue
-            passed[index] = used[index] if type(used[index]) is tuple else None
-            for place, component in zip(places, used[index], strict=True):
-                context.set_struct_arg_int(place, component)
+    def _pass_numbers(self, context: Any, used: Sequence[Any], passed: list[Any]) -> bool:
+        """Pass numbers to a context, of which it has those that are the same objects as those `passed` before.
+
+        Returns whether any were new.
+        """
+        is_changed = False
+        for numbers, set_number in ((self._floats, context.set_arg_float), (self._integers, context.set_arg_int)):
+            for index, place in numbers:
+                if used[index] is not passed[index]:
+                    set_number(place, used[index])
+                    passed[index], is_changed = used[index], True
+        for vectors, set_component in (
+            (self._float_vectors, context.set_struct_arg_float),
+            (self._integer_vectors, context.set_struct_arg_int),
+        ):
+            for index, places in vectors:
+                if used[index] is not passed[index]:
+                    for place, component in zip(places, used[index], strict=True):
+                        set_component(place, component)
+                    # Other vectors than tuples may be the same object with other numbers next time.
+                    passed[index], is_changed = used[index] if type(used[index]) is tuple else None, True
+        return is_changed
 
 
 def kernel(function: Callable[..., Any]) -> FastKernel:

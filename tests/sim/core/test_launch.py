@@ -1,10 +1,8 @@
-import ctypes
-
 import numpy as np
 import pytest
 import taichi as ti
 
-from sim.core.launch import ADDRESS_OF_ARRAY, MOST_LAUNCHES, FastKernel, _HostBuffers, kernel, on_compiled
+from sim.core.launch import MOST_LAUNCHES, FastKernel, kernel, on_compiled
 
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 AnyNumbers = ti.types.ndarray(ndim=1)
@@ -90,34 +88,6 @@ def test_a_kernel_forgets_calls_rather_than_remember_ever_more(taichi_cpu):
             fill(array, 2, 1.0, 0, (number, 0.0, 0.0), (0, 0, 0))
     assert len(fill._launches) <= MOST_LAUNCHES
     np.testing.assert_array_equal([array.to_numpy()[0] for array in kept], np.arange(len(kept)))
-
-
-def test_a_context_gets_back_what_a_launch_with_cuda_replaces(taichi_cpu):
-    refuse_doubles(ti.ndarray(ti.f32, 2))
-    compiled = next(iter(refuse_doubles._primal.compiled_kernels.values()))
-    context = compiled.make_launch_context()
-    buffers = _HostBuffers(context)
-    words = buffers._arguments, buffers._result
-    addresses = [word.value for word in words]
-    for word in words:
-        word.value = 16
-    buffers.restore()
-    assert [word.value for word in words] == addresses
-    context.set_struct_arg_uint((0, ADDRESS_OF_ARRAY), 0x1234)
-    assert ctypes.c_uint64.from_address(addresses[0] + 8).value == 0x1234  # behind the length, which is padded
-
-
-def test_memory_that_looks_otherwise_than_a_context_is_refused(taichi_cpu):
-    refuse_doubles(ti.ndarray(ti.f32, 2))
-    compiled = next(iter(refuse_doubles._primal.compiled_kernels.values()))
-    context = compiled.make_launch_context()
-    buffers = _HostBuffers(context)
-    buffers._result.value += 8
-    try:
-        with pytest.raises(RuntimeError, match=r"1\.7\.4"):
-            _HostBuffers(context)
-    finally:
-        buffers.restore()
 
 
 def test_each_element_type_has_its_own_compiled_kernel(taichi_cpu):
