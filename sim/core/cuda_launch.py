@@ -36,7 +36,7 @@ ENTRY = re.compile(r"\.visible \.entry (\w+_kernel_(\d+)_(\w+))\([^)]*\)\s*\.max
 ONE_THREAD, LOOP = "serial", "range_for"
 """Kinds of tasks that a graph can have."""
 
-ALIGNMENT = 256  # of memory of a device [bytes]
+SEEN_BY_DEVICE = ctypes.c_uint(2)  # CU_MEMHOSTALLOC_DEVICEMAP
 
 MULTIPROCESSORS, THREADS_OF_MULTIPROCESSOR = 16, 39  # numbers of a device's attributes
 
@@ -100,17 +100,15 @@ class Graph:
         self._context = ctypes.c_void_p()
         ask("cuCtxGetCurrent", ctypes.byref(self._context))
         (arguments, size), (result, result_size) = buffers.arguments, buffers.result
-        room = -(-size // ALIGNMENT) * ALIGNMENT
-        self._memory = ctypes.c_void_p()
-        ask("cuMemAlloc_v2", ctypes.byref(self._memory), ctypes.c_size_t(room + max(result_size, 1)))
-        assert self._memory.value is not None
-        result_there = ctypes.c_void_p(self._memory.value + room)
+        self._memory, self._answer = ctypes.c_void_p(), ctypes.c_void_p()
+        ask("cuMemAlloc_v2", ctypes.byref(self._memory), ctypes.c_size_t(max(size, 1)))
+        if result_size:
+            ask("cuMemHostAlloc", ctypes.byref(self._answer), ctypes.c_size_t(result_size), SEEN_BY_DEVICE)
         read = (ctypes.c_uint64 * 4).from_buffer_copy(ctypes.string_at(buffers.read, 32))
-        read[0], read[3] = self._memory.value, result_there.value or 0
+        read[0], read[3] = self._memory.value or 0, self._answer.value or 0
         self._graph = _instance_of(tasks, ctypes.addressof(read))
         self._put = self._memory, ctypes.c_void_p(arguments), ctypes.c_size_t(size), None
-        self._take = ctypes.c_void_p(result), result_there, ctypes.c_size_t(result_size), None
-        self._has_result = result_size > 0
+        self._taken = result, self._answer, result_size
         self._is_new = True
 
     def __del__(self) -> None:
@@ -118,9 +116,11 @@ class Graph:
             _make_current(self._context)
             ask("cuGraphExecDestroy", self._graph)
             ask("cuMemFree_v2", self._memory)
+            if self._answer:
+                ask("cuMemFreeHost", self._answer)
 
     def launch(self, *, is_changed: bool) -> None:
-        """Launch behind all that was asked for; the result gets to the host some time, if there is one.
+        """Launch behind all that was asked for.
 
         Args:
             is_changed: whether arguments differ from those of the launch before.
@@ -132,8 +132,10 @@ class Graph:
             check(library.cuMemcpyHtoDAsync_v2(*self._put), "cuMemcpyHtoDAsync")
             self._is_new = False
         check(library.cuGraphLaunch(self._graph, None), "cuGraphLaunch")
-        if self._has_result:
-            check(library.cuMemcpyDtoHAsync_v2(*self._take), "cuMemcpyDtoHAsync")
+
+    def take_result(self) -> None:
+        """Let the context have the result, which the device has written into memory of the host, after a wait."""
+        ctypes.memmove(*self._taken)
 
 
 class _Node(ctypes.Structure):

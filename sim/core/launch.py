@@ -218,6 +218,8 @@ class FastKernel:
             return None
         if not self._on_cpu:
             program.synchronize()
+            if launch.graph is not None:
+                launch.graph.take_result()
         kind = self._primal.return_type[0]
         if self._returns_vector:
             get = context.get_struct_ret_float if kind.dtype in _REAL_TYPES else context.get_struct_ret_int
@@ -269,14 +271,11 @@ class FastKernel:
         return self._primal.return_type is not None and isinstance(self._primal.return_type[0], VectorType)
 
     def _pass_numbers(self, context: Any, used: Sequence[Any], passed: list[Any]) -> bool:
-        """Pass numbers to a context, of which it has those that are the same objects as those `passed` before.
-
-        Returns whether any were new.
-        """
+        """Pass numbers to a context that has those that were `passed` before; returns whether any differ."""
         is_changed = False
         for numbers, set_number in ((self._floats, context.set_arg_float), (self._integers, context.set_arg_int)):
             for index, place in numbers:
-                if used[index] is not passed[index]:
+                if used[index] is not passed[index] and not _is_same(used[index], passed[index]):
                     set_number(place, used[index])
                     passed[index], is_changed = used[index], True
         for vectors, set_component in (
@@ -290,6 +289,11 @@ class FastKernel:
                     # Other vectors than tuples may be the same object with other numbers next time.
                     passed[index], is_changed = used[index] if type(used[index]) is tuple else None, True
         return is_changed
+
+
+def _is_same(number: Any, before: Any) -> bool:
+    """Whether a number is certainly the one before, bit by bit: 0.0 equals -0.0."""
+    return type(number) is type(before) and number == before and (type(number) is int or number != 0.0)
 
 
 def kernel(function: Callable[..., Any]) -> FastKernel:

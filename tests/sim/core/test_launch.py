@@ -24,6 +24,11 @@ def fill(
 
 
 @kernel
+def place(numbers: Floats, value: ti.f32):
+    numbers[0] = value
+
+
+@kernel
 def ends(numbers: Floats, count: ti.i32) -> Pair:
     return Pair(numbers[0], numbers[count - 1])
 
@@ -79,6 +84,14 @@ def test_calls_that_come_again_write_to_the_arrays_of_the_call(taichi_cpu):
             halve(halved)
             np.testing.assert_array_equal(halved.to_numpy(), length / 2**power)
         del halved
+
+
+def test_numbers_that_are_equal_but_not_the_same_are_passed(taichi_cpu):
+    numbers = ti.ndarray(ti.f32, 2)
+    for value in (0.0, -0.0, 0.0, 2.5, float("2.5"), float("nan"), float("nan"), -0.0):
+        numbers.fill(1.0)
+        place(numbers, value)
+        assert repr(float(numbers.to_numpy()[0])) == repr(value)
 
 
 def test_a_kernel_forgets_calls_rather_than_remember_ever_more(taichi_cpu):
