@@ -49,6 +49,13 @@ class Task(NamedTuple):
     threads: int  # of a block
 
 
+class Tasks(NamedTuple):
+    """All tasks of a kernel, in order, in a context of the driver."""
+
+    context: int
+    tasks: list[Task]
+
+
 class HostBuffers:
     """Where a launch context has its arguments and its result in the host's memory.
 
@@ -93,12 +100,12 @@ class Graph:
 
     Args:
         tasks: of the kernel.
-        buffers: of a context that Taichi has launched before, in this thread.
+        buffers: of a context that Taichi has launched before.
     """
 
-    def __init__(self, tasks: Sequence[Task], buffers: HostBuffers) -> None:
-        self._context = ctypes.c_void_p()
-        ask("cuCtxGetCurrent", ctypes.byref(self._context))
+    def __init__(self, tasks: Tasks, buffers: HostBuffers) -> None:
+        self._context = ctypes.c_void_p(tasks.context)
+        _make_current(self._context)
         (arguments, size), (result, result_size) = buffers.arguments, buffers.result
         self._memory, self._answer = ctypes.c_void_p(), ctypes.c_void_p()
         ask("cuMemAlloc_v2", ctypes.byref(self._memory), ctypes.c_size_t(max(size, 1)))
@@ -106,7 +113,7 @@ class Graph:
             ask("cuMemHostAlloc", ctypes.byref(self._answer), ctypes.c_size_t(result_size), SEEN_BY_DEVICE)
         read = (ctypes.c_uint64 * 4).from_buffer_copy(ctypes.string_at(buffers.read, 32))
         read[0], read[3] = self._memory.value or 0, self._answer.value or 0
-        self._graph = _instance_of(tasks, ctypes.addressof(read))
+        self._graph = _instance_of(tasks.tasks, ctypes.addressof(read))
         self._put = self._memory, ctypes.c_void_p(arguments), ctypes.c_size_t(size), None
         self._taken = result, self._answer, result_size
         self._is_new = True
@@ -175,12 +182,16 @@ def _make_current(context: ctypes.c_void_p) -> None:
         _threads.context = context.value
 
 
-def tasks_of(kernel: str, first_launch: Callable[[], Any]) -> tuple[Any, list[Task] | None]:
+def tasks_of(kernel: str, first_launch: Callable[[], Any]) -> tuple[Any, Tasks | None]:
     """What the first launch of a kernel of this name returns, and its tasks; None where they are not to be had."""
     result, texts = watched(first_launch)
     own = [text for text in texts if f".visible .entry {kernel}_c".encode() in text]
     entries = entries_of(own[0].decode()) if len(own) == 1 else None
-    return result, None if entries is None else _loaded(own[0], entries)
+    compiling = _compiling_thread()
+    if entries is None or compiling is None:
+        return result, None
+    # There, Taichi's context is the current one since the launch.
+    return result, compiling.pool.submit(_loaded, own[0], entries).result()
 
 
 def entries_of(ptx: str) -> list[tuple[str, str, int]] | None:
@@ -191,9 +202,10 @@ def entries_of(ptx: str) -> list[tuple[str, str, int]] | None:
     return [entry[1:] for entry in entries]
 
 
-def _loaded(ptx: bytes, entries: Sequence[tuple[str, str, int]]) -> list[Task]:
+def _loaded(ptx: bytes, entries: Sequence[tuple[str, str, int]]) -> Tasks:
     """Tasks in the driver, which has compiled them before and remembers it; loops of them fill the device once."""
-    module, device, tasks = ctypes.c_void_p(), ctypes.c_int(), []
+    context, module, device, tasks = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int(), []
+    ask("cuCtxGetCurrent", ctypes.byref(context))
     ask("cuModuleLoadData", ctypes.byref(module), ctypes.c_char_p(ptx))
     ask("cuCtxGetDevice", ctypes.byref(device))
     held = 1
@@ -206,7 +218,8 @@ def _loaded(ptx: bytes, entries: Sequence[tuple[str, str, int]]) -> list[Task]:
         ask("cuModuleGetFunction", ctypes.byref(function), module, name.encode())
         assert function.value is not None
         tasks.append(Task(function.value, *((1, 1) if kind == ONE_THREAD else (held // threads, threads))))
-    return tasks
+    assert context.value is not None
+    return Tasks(context.value, tasks)
 
 
 def watched(first_launch: Callable[[], Any]) -> tuple[Any, list[bytes]]:

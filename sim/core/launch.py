@@ -26,7 +26,7 @@ from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
 
 from sim.core.bundles import field_paths, flattened, is_used, with_fields_as_arguments
-from sim.core.cuda_launch import Graph, HostBuffers, Task, tasks_of
+from sim.core.cuda_launch import Graph, HostBuffers, Tasks, tasks_of
 
 _REAL_TYPES = frozenset(primitive_types.real_types)
 
@@ -56,7 +56,7 @@ class _Launch:
     numbers: list[Any]  # what that context has, by argument
     handles: list[tuple[tuple[int], Any]]  # of the arrays, by place; on other GPUs
     arrays: tuple[weakref.ref[Any], ...]
-    tasks: list[Task] | None = None  # with CUDA, where they are known
+    tasks: Tasks | None = None  # with CUDA, where they are known
     buffers: HostBuffers | None = None  # with CUDA
     graph: Graph | None = None
     count: int = 0  # of launches before there is a graph
@@ -104,7 +104,7 @@ class FastKernel:
         self._primal = kernel._primal
         self._kinds = getattr(self._primal.func, "__bundles__", (None,) * len(self._primal.arguments))
         self._program: Any = None
-        self._compiled: dict[tuple[Any, ...], tuple[Any, Any, list[Task] | None]] = {}
+        self._compiled: dict[tuple[Any, ...], tuple[Any, Any, Tasks | None]] = {}
         self._launches: dict[tuple[Any, ...], _Launch] = {}
         self._on_cpu = self._on_cuda = False
         self._sort_arguments()
@@ -131,7 +131,7 @@ class FastKernel:
         self,
         program: Any,
         key: tuple[Any, ...],
-        compiled: tuple[Any, Any, list[Task] | None],
+        compiled: tuple[Any, Any, Tasks | None],
         arrays: Sequence[Any],
         used: int,
     ) -> _Launch:
