@@ -9,7 +9,7 @@ from sim.cloth.bundles import Air, NodeMotion, Nodes
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
-from sim.core.arrays import Integers, Vectors
+from sim.core.arrays import Vectors
 from sim.core.launch import kernel
 from sim.core.parameters import KeyRefusedError, Vector3
 
@@ -64,6 +64,16 @@ class ClothAir:
         around = np.bincount(triangles.ravel(), weights=np.repeat(triangle_areas(host.position, triangles), 3))
         self.share = ti.ndarray(ti.f32, state.vertex_count)
         self.share.from_numpy((host.node_area / around).astype(np.float32))
+        self._on_device = Air(
+            self.velocity,
+            self.inverse_mass,
+            self._drag,
+            self.share,
+            self.force,
+            self.impulse,
+            self.triangle_start,
+            self.triangle_list,
+        )
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
         """Drag and wind as the parameters have them now; air that a coupling put there stays.
@@ -102,9 +112,7 @@ class ClothAir:
             state.position,
             state.triangles,
             *(triangles if self.acts else (0, 0)),
-            Air(self.velocity, self.inverse_mass, self._drag, self.share, self.force, self.impulse),
-            self.triangle_start,
-            self.triangle_list,
+            self._on_device,
             state.nodes,
             state.motion,
             *nodes,
@@ -148,8 +156,6 @@ def predict_in_air(
     first_triangle: ti.i32,
     end_triangle: ti.i32,
     air: Air,
-    triangle_start: Integers,
-    triangle_list: Integers,
     nodes: Nodes,
     motion: NodeMotion,
     first: ti.i32,
@@ -214,8 +220,8 @@ def predict_in_air(
             v_i = motion.velocity[i] + dt * gravity
             if end_triangle > first_triangle:
                 force = ti.math.vec3(0.0)
-                for k in range(triangle_start[i], triangle_start[i + 1]):
-                    force += air.force[triangle_list[k]]
+                for k in range(air.triangle_start[i], air.triangle_start[i + 1]):
+                    force += air.force[air.triangle_list[k]]
                 v_i += dt * w_i * air.share[i] * force
             motion.velocity[i] = v_i
             nodes.displacement[i] = motion.carry[i] + dt * v_i

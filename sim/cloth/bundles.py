@@ -56,6 +56,14 @@ class Surface(NamedTuple):
 
 
 @bundle
+class Rest(NamedTuple):
+    """Nodes at rest."""
+
+    cloth: Integers  # number of each node's cloth, (n,)
+    position: Vectors  # [m], (n,)
+
+
+@bundle
 class SpringArrays(NamedTuple):
     """Springs of one family, s of them."""
 
@@ -174,6 +182,8 @@ class Air(NamedTuple):
     share: Floats  # of each node in the force on its triangles [-], (n,)
     force: Vectors  # [N], (k,)
     impulse: Vectors  # [N s], (k,)
+    triangle_start: Integers  # of each node in the list, (n + 1,)
+    triangle_list: Integers
 
 
 # --- rows of rectangles ---------------------------------------------------------------------------------------------
@@ -194,6 +204,7 @@ class Rectangle(NamedTuple):
 class Lines(NamedTuple):
     """Lines of a rectangle along one direction."""
 
+    count: ti.i32
     is_turned: ti.i32  # whether they run along x
     length: ti.i32  # nodes of a line
     strips: ti.i32  # blocks beside each other
@@ -234,6 +245,14 @@ class PatchElements(NamedTuple):
 
 
 @bundle
+class PatchLists(NamedTuple):
+    """What of the cloth each patch has: its own nodes, its edges and triangles."""
+
+    vertices: PatchNodes
+    elements: PatchElements
+
+
+@bundle
 class TrackedNodes(NamedTuple):
     """Nodes as patches follow them."""
 
@@ -251,6 +270,14 @@ class PatchMotion(NamedTuple):
     turn: Vectors  # [rad], (m,)
     radius: Floats  # largest distance of a corner from the centre [m], (m,)
     rest: Floats  # largest difference of a displacement from that motion [m], (m,)
+
+
+@bundle
+class Boxes(NamedTuple):
+    """Boxes of the patches at the start of the substep."""
+
+    low: Vectors  # [m], (m,)
+    high: Vectors
 
 
 @bundle
@@ -273,6 +300,15 @@ class PatchBudget(NamedTuple):
     spent: Floats  # sum over the substeps since the patches were paired
     travel: Floats  # `spent`, with this substep and `more`
     reach: Floats  # which `travel` may have until they are paired anew
+
+
+@bundle
+class MovingPatches(NamedTuple):
+    """Patches as their motion is followed."""
+
+    corners: PatchNodes  # all nodes of their triangles
+    bounds: PatchBounds
+    budget: PatchBudget
 
 
 @bundle
@@ -320,6 +356,25 @@ class PatchPairArrays(NamedTuple):
     reach: Floats  # [m]
     due: Integers
     expired: Integers
+    needed: Integers  # of patches, (m,)
+
+
+@bundle
+class Ageing(NamedTuple):
+    """What decides whether the list of a pair of patches is searched anew, or looked at."""
+
+    thickness: ti.f32  # the largest [m]
+    least_skin: ti.f32  # how far beyond to search at least [m]
+    first_due: Floats  # the largest `due` of the vertices with triangles of each pair [m], (p,)
+    first_due_of_edges: Floats
+
+
+@bundle
+class Counters(NamedTuple):
+    """What threads count together."""
+
+    taken: Integers  # items of each loop; see `sim.core.scheduling`
+    found: Integers
 
 
 # --- pairs of elements ----------------------------------------------------------------------------------------------
@@ -334,6 +389,16 @@ class PairPieces(NamedTuple):
     pairs: Quadruples
     wanted: Floats  # [m]
     due: Floats  # [m]
+    again: Integers  # numbers of pieces that are searched again, (p,)
+
+
+@bundle
+class PairLists(NamedTuple):
+    """Both lists of pairs of elements."""
+
+    triangles: PairPieces  # of vertices with triangles
+    edges: PairPieces
+    ends: Integers  # of both lists; then how many pieces are to be searched again, (4,)
 
 
 @bundle
@@ -364,6 +429,15 @@ class TriangleBlocks(NamedTuple):
     high_z: Floats
 
 
+@bundle
+class PatchBlocks(NamedTuple):
+    """Elements of patches as they are searched."""
+
+    vertices: PatchNodes
+    triangles: TriangleBlocks
+    edges: EdgeBlocks
+
+
 # --- contacts -------------------------------------------------------------------------------------------------------
 
 
@@ -380,6 +454,16 @@ class Contacts(NamedTuple):
     friction: Floats  # [-]
     counter: Integers  # (3,)
     capacity: ti.i32
+
+
+@bundle
+class TestedContacts(NamedTuple):
+    """What the test of contacts for crossings reads and writes besides; see `repair_crossing`."""
+
+    impulse: Vectors  # [kg m], (c,)
+    inverse_mass: Floats  # [1/kg], (n,)
+    thickness: Floats  # [m], (n,)
+    crossing: Integers  # (c,)
 
 
 @bundle
@@ -461,6 +545,7 @@ class Walls(NamedTuple):
     """Closed faces of the domain, (w,) each."""
 
     count: ti.i32  # w
+    spacing: ti.f32  # mean edge of the coarsest cloth [m]
     plane: Planes  # normal into the domain, and its product with a point of the wall [m]
     low: Vectors  # corners of the wall [m], infinite across it
     high: Vectors

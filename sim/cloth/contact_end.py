@@ -2,7 +2,16 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import Contacts, PatchBounds, PatchBudget, PatchNodes, PatchPairArrays, SubstepEnd, TrackedNodes
+from sim.cloth.bundles import (
+    Contacts,
+    Counters,
+    MovingPatches,
+    PatchNodes,
+    PatchPairArrays,
+    SubstepEnd,
+    TestedContacts,
+    TrackedNodes,
+)
 from sim.cloth.continuous_response import repair_crossing
 from sim.cloth.patch_motion_kernels import (
     PAIRS_AT_A_TIME,
@@ -21,33 +30,27 @@ from sim.core.scheduling import begin_sharing, next_item
 def end_contacts(
     count: ti.i32,
     contacts: Contacts,
-    impulse: Vectors,
-    inverse_mass: Floats,
-    thickness: Floats,
-    crossing: Integers,
+    tested: TestedContacts,
     vertex_count: ti.i32,
     nodes: TrackedNodes,
     predicted: Vectors,
-    corners: PatchNodes,
-    patches: PatchBounds,
-    budget: PatchBudget,
+    patches: MovingPatches,
     end: SubstepEnd,
     met: PatchPairArrays,
     workers: ti.math.ivec3,
-    taken: Integers,
-    counter: Integers,
+    counters: Counters,
     is_short: ti.template(),
 ) -> ti.math.ivec3:
     """Test `count` contacts (`repair_crossing`); if none failed, measure how far they displaced patches; if not farther
     than allowed for, displacements are final: note where they lead, and what of the lists they use up.
 
     Args:
-        count, contacts, impulse, inverse_mass, thickness, crossing: see `repair_crossing`.
-        vertex_count, nodes, corners: the vertices, and those of each patch.
+        count, contacts, tested: see `repair_crossing`.
+        vertex_count, nodes: the vertices.
         predicted: displacements before contacts [m].
-        patches, budget, end, met: see `finish_patch` and `finish_pair`.
-        workers, taken: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
-        counter: three integers to count with.
+        patches, end, met: see `finish_patch` and `finish_pair`.
+        workers: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
+        counters: three numbers.
 
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
     is not finite.
@@ -60,52 +63,60 @@ def end_contacts(
         workers[1],
         workers[2],
     )
-    counter[0], counter[1], counter[2] = 0, 0, 0
+    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for c in range(contacts_end):
         repair_crossing(
-            c, contacts, impulse, nodes.position, nodes.displacement, inverse_mass, thickness, crossing, counter
+            c,
+            contacts,
+            tested.impulse,
+            nodes.position,
+            nodes.displacement,
+            tested.inverse_mass,
+            tested.thickness,
+            tested.crossing,
+            counters.found,
         )
-    begin_sharing(taken, 0)
+    begin_sharing(counters.taken, 0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for worker in range(displaced_end):
-        stop = ti.select(counter[0] == 0, corners.count, 0)
-        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        stop = ti.select(counters.found[0] == 0, patches.corners.count, 0)
+        m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
         while m < stop:
             measure_change(
                 m,
-                corners,
+                patches.corners,
                 nodes.displacement,
                 predicted,
                 end.half_thickness,
-                budget.change,
-                budget.margin,
-                budget.more,
-                counter,
+                patches.budget.change,
+                patches.budget.margin,
+                patches.budget.more,
+                counters.found,
             )
-            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+            m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for i in range(vertices_end):
-        if counter[0] + counter[1] + counter[2] == 0:
+        if counters.found[0] + counters.found[1] + counters.found[2] == 0:
             nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
-    begin_sharing(taken, 1)
+    begin_sharing(counters.taken, 1)
     for worker in range(patches_end):
-        stop = ti.select(counter[0] + counter[1] + counter[2] == 0, corners.count, 0)
-        m = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
+        stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, patches.corners.count, 0)
+        m = next_item(-1, worker, counters.taken, 1, PATCHES_AT_A_TIME)
         while m < stop:
-            finish_patch(m, nodes, corners, patches, budget, end)
-            m = next_item(m, worker, taken, 1, PATCHES_AT_A_TIME)
-    begin_sharing(taken, 2)
+            finish_patch(m, nodes, patches, end)
+            m = next_item(m, worker, counters.taken, 1, PATCHES_AT_A_TIME)
+    begin_sharing(counters.taken, 2)
     for worker in range(pairs_end):
-        stop = ti.select(counter[0] + counter[1] + counter[2] == 0, met.count, 0)
-        p = next_item(-1, worker, taken, 2, PAIRS_AT_A_TIME)
+        stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, met.count, 0)
+        p = next_item(-1, worker, counters.taken, 2, PAIRS_AT_A_TIME)
         while p < stop:
-            finish_pair(p, met, patches, budget, end.negligible)
-            p = next_item(p, worker, taken, 2, PAIRS_AT_A_TIME)
-    return ti.math.ivec3(counter[0], counter[1], counter[2])
+            finish_pair(p, met, patches, end.negligible)
+            p = next_item(p, worker, counters.taken, 2, PAIRS_AT_A_TIME)
+    return ti.math.ivec3(counters.found[0], counters.found[1], counters.found[2])
 
 
 @kernel

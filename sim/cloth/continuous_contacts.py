@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
@@ -398,6 +399,7 @@ class ImpactZones:
         return result
 
 
+@functools.cache
 def _momenta_from(first: int) -> tuple[float, ...]:
     """Momenta of the steps of one launch, from that of step `first` of an iteration on, and of the step after them."""
     return tuple(k / (k + 3.0) for k in range(first, first + STEPS + 1))

@@ -32,8 +32,9 @@ class DeviceCells:
         arity: nodes of a cell.
         count: number of cells.
         law: as `Cells.law` has it, (count, 4).
+        is_damped: whether any of them is.
         cloths: numbers of the cloths that they belong to.
-        first_colours: first colour of each group of `COLOURS_AT_ONCE`; the last group may have empty ones.
+        first_colours: as of `DeviceSprings`.
         mesh: nodes of triangles; nothing of rectangles.
         own, chunks, pieces: how many nodes, chunks and pieces those are.
         cell_of_colour: first cell of each colour, and number of cells, (colours + 1,).
@@ -45,6 +46,7 @@ class DeviceCells:
         self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
+        self.is_damped = False
         self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
         self.multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
         nodes, along, across = (ti.ndarray(kind, self.count * self.arity) for kind in (ti.i32, ti.f32, ti.f32))
@@ -54,16 +56,12 @@ class DeviceCells:
         self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
         self.on_device = CellArrays(nodes, along, across, ti.Vector.ndarray(4, ti.f32, self.count))
 
-    @property
-    def is_damped(self) -> bool:
-        """Whether any of them is."""
-        return bool((self.law[:, :2] * self.law[:, 3:]).any())
-
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
         for number, cloth in enumerate(cloths):
             own = self._cloth_of == number
             self.law[own] = self.host.law(cloth)[own]
+        self.is_damped = bool((self.law[:, :2] * self.law[:, 3:]).any())
         self.on_device.law.from_numpy(self.law.astype(np.float32))
         if self.arity == TRIANGLE:
             nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)
@@ -213,18 +211,20 @@ def solve_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, 
 def solve_shears(
     cells: CellArrays,
     cell_of_colour: Integers,
-    colour: ti.i32,
     nodes: Nodes,
     dt_squared: ti.f32,
     is_first: ti.i32,
     multiplier: Floats,
+    colours: ti.template(),
 ):
-    """The cells of some colours, from `colour` on, one colour after the other; multipliers start at 0 if `is_first`."""
-    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(cell_of_colour, colour)
-    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
-        for s in range(start, stop):
-            solve_shear(s, cells, nodes, dt_squared, is_first, multiplier)
+    """The cells of all colours, one after the other; if `is_first`, `SHEAR_SWEEPS` times, from multipliers of 0."""
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    bounds = colour_bounds(cell_of_colour, 0, colours)
+    ends = ti.Vector([bounds[k] + is_first * (bounds[k + 1] - bounds[k]) for k in ti.static(range(colours))])
+    for sweep in ti.static(range(SHEAR_SWEEPS)):
+        for k in ti.static(range(colours)):
+            for s in range(bounds[k], bounds[k + 1] if ti.static(sweep == 0) else ends[k]):
+                solve_shear(s, cells, nodes, dt_squared, is_first if ti.static(sweep == 0) else 0, multiplier)
 
 
 @func
@@ -250,12 +250,13 @@ def damp_shears(
     nodes: Nodes,
     motion: NodeMotion,
     dt: ti.f32,
+    colours: ti.template(),
 ):
-    """The cells of some colours, one colour after the other."""
+    """The cells of so many colours, one colour after the other."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(cell_of_colour, colour)
-    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
-        for s in range(start, stop):
+    bounds = colour_bounds(cell_of_colour, colour, colours)
+    for k in ti.static(range(colours)):
+        for s in range(bounds[k], bounds[k + 1]):
             damp_shear(s, cells, nodes, motion, dt)
 
 

@@ -13,10 +13,9 @@ from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
 
-COLOURS_AT_ONCE = 4
-"""Colours that are loops of one kernel: a launch costs 20 us of the host, and every loop its time to compile."""
-
-Bounds = ti.types.vector(COLOURS_AT_ONCE + 1, ti.i32)
+MOST_COLOURS_AT_ONCE = 6
+"""Colours that are loops of one kernel, at most, as many as bends of rectangles have: a launch costs 20 us of the host,
+and every loop its time to compile."""
 
 TINY_LENGTH = 1.0e-12
 """Springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there."""
@@ -35,7 +34,8 @@ class DeviceSprings:
         is_damped: whether any of them is.
         contracts: whether any of them feels the strain across.
         shift: what springs of threads count as longer by it [m], (count,).
-        first_colours: first colour of each group of `COLOURS_AT_ONCE`; the last group may have empty ones.
+        first_colours: first colour of each group of those that are solved in one launch, `first_colours.step` each;
+            the last group may have empty ones.
         piece_of_colour: first piece of each colour, and number of pieces, (colours + 1,); a piece is one spring where
             springs are solved one by one.
         in_segments: whether these are threads.
@@ -128,7 +128,8 @@ class DeviceSprings:
 
 
 def colour_groups(colours: NDArray[np.int32], starts: NDArray[np.integer], count: int) -> tuple[range, ti.Ndarray]:
-    """First colour of each group of `COLOURS_AT_ONCE`; first piece of each colour, and number of pieces from there on.
+    """First colour of each group of up to `MOST_COLOURS_AT_ONCE`, as many in each; first piece of each colour, and
+    number of pieces from there on.
 
     Args:
         colours: of springs or cells, sorted.
@@ -136,8 +137,9 @@ def colour_groups(colours: NDArray[np.int32], starts: NDArray[np.integer], count
         count: number of pieces.
     """
     firsts = np.flatnonzero(np.diff(colours[starts], prepend=-1))
-    groups = range(0, len(firsts), COLOURS_AT_ONCE)
-    padding = [count] * (len(groups) * COLOURS_AT_ONCE + 1 - len(firsts))
+    launches = max(1, -(-len(firsts) // MOST_COLOURS_AT_ONCE))
+    groups = range(0, len(firsts), max(1, -(-len(firsts) // launches)))
+    padding = [count] * (len(groups) * groups.step + 1 - len(firsts))
     firsts = np.concatenate([firsts, padding])
     piece_of_colour = ti.ndarray(ti.i32, len(firsts))
     piece_of_colour.from_numpy(firsts.astype(np.int32))
@@ -177,15 +179,9 @@ def coefficient(springs: SpringArrays, s: ti.i32, arity: ti.template(), a: ti.te
 
 
 @ti.func
-def colour_bounds(piece_of_colour: Integers, first: ti.i32) -> Bounds:
-    """Where each of `COLOURS_AT_ONCE` colours begins, from `first` on, and where the last one ends."""
-    return Bounds(
-        piece_of_colour[first],
-        piece_of_colour[first + 1],
-        piece_of_colour[first + 2],
-        piece_of_colour[first + 3],
-        piece_of_colour[first + 4],
-    )
+def colour_bounds(piece_of_colour: Integers, first: ti.i32, colours: ti.template()):
+    """Where each of some colours begins, from `first` on, and where the last one ends."""
+    return ti.Vector([piece_of_colour[first + k] for k in ti.static(range(colours + 1))])
 
 
 @func

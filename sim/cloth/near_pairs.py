@@ -3,13 +3,13 @@
 import taichi as ti
 
 from sim.cloth.bundles import (
+    Boxes,
     Contacts,
-    EdgeBlocks,
-    PairPieces,
-    PatchNodes,
+    PairLists,
+    PatchBlocks,
     PatchPairArrays,
+    Rest,
     Surface,
-    TriangleBlocks,
 )
 from sim.cloth.element_blocks import enclose_elements
 from sim.cloth.self_collision_kernels import (
@@ -19,7 +19,7 @@ from sim.cloth.self_collision_kernels import (
     pair_edges,
     pair_vertices_with_triangles,
 )
-from sim.core.arrays import Integers, Vectors
+from sim.core.arrays import Integers
 from sim.core.launch import kernel
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
@@ -34,20 +34,11 @@ def find_near_pairs(
     workers: ti.math.ivec3,
     taken: Integers,
     met: PatchPairArrays,
-    needed: Integers,
-    low: Vectors,
-    high: Vectors,
-    vertices: PatchNodes,
-    blocks: TriangleBlocks,
-    edge_blocks: EdgeBlocks,
-    listed: PairPieces,
-    listed_edges: PairPieces,
-    again: Integers,
-    edges_again: Integers,
-    ends: Integers,
+    boxes: Boxes,
+    blocks: PatchBlocks,
+    lists: PairLists,
     surface: Surface,
-    cloth: Integers,
-    rest: Vectors,
+    rest: Rest,
     recovery: ti.f32,
     contacts: Contacts,
 ):
@@ -67,13 +58,10 @@ def find_near_pairs(
     Args:
         numbers: of pairs of patches that are searched, and that are due; most pairs of elements of both lists.
         workers, taken: see `sim.core.scheduling`; for patches, for searches, and for pairs that are due.
-        met, needed, low, high: all pairs of patches; whether a pair of a patch is searched, 0 after; their boxes [m].
-        vertices, blocks, edge_blocks: elements of the patches.
-        listed, listed_edges: lists of vertices with triangles, and of edges.
-        again, edges_again: get the numbers of their pieces that were too short.
-        ends: of both lists; then how many pieces are to be searched again.
-        surface, cloth: of all nodes.
-        rest: positions of all nodes at rest [m].
+        met, boxes: all pairs of patches, of which `needed` is 0 after; where patches are.
+        blocks: elements of the patches.
+        lists: of vertices with triangles, and of edges; `again` gets the numbers of pieces that were too short.
+        surface, rest: all nodes.
         recovery: share of a missing distance that the substep gives back [-].
         contacts: the list; its second and third number become the ends that both lists need.
     """
@@ -81,17 +69,17 @@ def find_near_pairs(
     count, due_count, enclosing, searching, looking = numbers[0], numbers[1], workers[0], workers[1], workers[2]
     lanes = ti.static(lanes_of_pair())
     if count > 0:
-        ends[2], ends[3] = 0, 0
+        lists.ends[2], lists.ends[3] = 0, 0
     begin_sharing(taken, 0)
     for worker in range(enclosing):
         item = next_item(-1, worker, taken, 0, ENCLOSED_AT_A_TIME)
-        while item < vertices.count + count:
-            if item >= vertices.count:
-                p = met.expired[item - vertices.count]
-                listed.pieces[p][2], listed_edges.pieces[p][2] = 0, 0
-            elif needed[item] == 1:
-                needed[item] = 0
-                enclose_elements(item, surface.position, edge_blocks, blocks)
+        while item < blocks.vertices.count + count:
+            if item >= blocks.vertices.count:
+                p = met.expired[item - blocks.vertices.count]
+                lists.triangles.pieces[p][2], lists.edges.pieces[p][2] = 0, 0
+            elif met.needed[item] == 1:
+                met.needed[item] = 0
+                enclose_elements(item, surface.position, blocks.edges, blocks.triangles)
             item = next_item(item, worker, taken, 0, ENCLOSED_AT_A_TIME)
     begin_sharing(taken, 1)
     for worker in range(searching):
@@ -99,18 +87,18 @@ def find_near_pairs(
         while item < 2 * count * lanes:
             if item < count * lanes:
                 p = met.expired[item // lanes]
-                pair_vertices_with_triangles(p, item % lanes, lanes, met, low, high, surface, vertices, blocks, listed)
+                pair_vertices_with_triangles(p, item % lanes, lanes, met, boxes, surface, blocks, lists.triangles)
             else:
                 p = met.expired[item // lanes - count]
-                pair_edges(p, item % lanes, lanes, met, low, high, edge_blocks, listed_edges)
+                pair_edges(p, item % lanes, lanes, met, boxes, blocks.edges, lists.edges)
             item = next_item(item, worker, taken, 1, SEARCHED_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for k in range(count):
-        lengthen(met.expired[k], listed.pieces, again, ends, 0)
-        lengthen(met.expired[k], listed_edges.pieces, edges_again, ends, 1)
-    fits = ti.cast(ends[0] <= numbers[2] and ends[1] <= numbers[3], ti.i32)
-    short, short_edges = fits * ends[2], fits * ends[3]
+        lengthen(met.expired[k], lists.triangles, lists.ends, 0)
+        lengthen(met.expired[k], lists.edges, lists.ends, 1)
+    fits = ti.cast(lists.ends[0] <= numbers[2] and lists.ends[1] <= numbers[3], ti.i32)
+    short, short_edges = fits * lists.ends[2], fits * lists.ends[3]
     searching_again, looking_now = ti.min(short + short_edges, 1) * searching, fits * looking
     if ti.static(runs_on_gpu()):
         searching_again = (short + short_edges) * lanes
@@ -119,11 +107,11 @@ def find_near_pairs(
         item = next_item(-1, worker, taken, 2, SEARCHED_AT_A_TIME)
         while item < (short + short_edges) * lanes:
             if item < short * lanes:
-                p = again[item // lanes]
-                pair_vertices_with_triangles(p, item % lanes, lanes, met, low, high, surface, vertices, blocks, listed)
+                p = lists.triangles.again[item // lanes]
+                pair_vertices_with_triangles(p, item % lanes, lanes, met, boxes, surface, blocks, lists.triangles)
             else:
-                p = edges_again[item // lanes - short]
-                pair_edges(p, item % lanes, lanes, met, low, high, edge_blocks, listed_edges)
+                p = lists.edges.again[item // lanes - short]
+                pair_edges(p, item % lanes, lanes, met, boxes, blocks.edges, lists.edges)
             item = next_item(item, worker, taken, 2, SEARCHED_AT_A_TIME)
     begin_sharing(taken, 3)
     for worker in range(looking_now):
@@ -134,11 +122,10 @@ def find_near_pairs(
                     met.due[item // lanes],
                     item % lanes,
                     lanes,
-                    listed,
+                    lists.triangles,
                     met,
                     False,
                     surface,
-                    cloth,
                     rest,
                     recovery,
                     contacts,
@@ -148,15 +135,14 @@ def find_near_pairs(
                     met.due[item // lanes - due_count],
                     item % lanes,
                     lanes,
-                    listed_edges,
+                    lists.edges,
                     met,
                     True,
                     surface,
-                    cloth,
                     rest,
                     recovery,
                     contacts,
                 )
             item = next_item(item, worker, taken, 3, DUE_AT_A_TIME)
-    ends[2], ends[3] = ends[2] - short, ends[3] - short_edges
-    contacts.counter[1], contacts.counter[2] = ends[0], ends[1]
+    lists.ends[2], lists.ends[3] = lists.ends[2] - short, lists.ends[3] - short_edges
+    contacts.counter[1], contacts.counter[2] = lists.ends[0], lists.ends[1]

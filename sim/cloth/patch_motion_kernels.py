@@ -3,8 +3,11 @@
 import taichi as ti
 
 from sim.cloth.bundles import (
+    Ageing,
     BoxTree,
+    Counters,
     KnownPairs,
+    MovingPatches,
     PatchBounds,
     PatchBudget,
     PatchMotion,
@@ -48,21 +51,13 @@ def look_at_patches(
     vertex_count: ti.i32,
     nodes: TrackedNodes,
     of_vertices: Share,
-    still: ti.f32,
-    corners: PatchNodes,
-    patches: PatchBounds,
-    budget: PatchBudget,
-    patch_workers: ti.i32,
     known_astray: ti.f32,
+    still: ti.f32,
+    patches: MovingPatches,
     met: PatchPairArrays,
-    pair_workers: ti.i32,
-    thickness: ti.f32,
-    least_skin: ti.f32,
-    first_due: Floats,
-    first_due_of_edges: Floats,
-    needed: Integers,
-    counter: Integers,
-    taken: Integers,
+    ageing: Ageing,
+    workers: ti.math.ivec2,
+    counters: Counters,
     is_short: ti.template(),
 ) -> ti.math.ivec4:
     """Where patches are, and how they move in this substep; then, if the list of their pairs holds, which of these have
@@ -74,21 +69,20 @@ def look_at_patches(
 
     Args:
         vertex_count: 0 if patches have been looked at; nothing but `known_astray` is asked then.
-        nodes, of_vertices, corners: the vertices, how lanes share them, and those of each patch.
-        still: see `fit_motion`.
-        patches, budget: get the motion.
-        patch_workers, pair_workers, taken: see `sim.core.scheduling`.
+        nodes, of_vertices: the vertices, and how lanes share them.
         known_astray: largest distance of a vertex from where it was left [m].
-        met: the pairs; see `age_pair`.
-        thickness, least_skin, first_due, first_due_of_edges, needed: see `age_pair`.
-        counter: gets the two numbers of pairs, and whether the list does not hold.
+        still: see `fit_motion`.
+        patches: get the motion.
+        met, ageing: the pairs; see `age_pair`.
+        workers: see `sim.core.scheduling`; for patches, and for their pairs.
+        counters: get the two numbers of pairs, and whether the list does not hold.
 
     Returns half the diagonal of the box of all displacements, and how far a vertex is at most from where its last
     displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
     not hold; and of how many some elements are due.
     """
-    patches_end, pairs_end = patch_workers, pair_workers
-    counter[0], counter[1], counter[2] = 0, 0, 0
+    patches_end, pairs_end = workers[0], workers[1]
+    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for lane in range(of_vertices.tree.lanes):
@@ -109,31 +103,33 @@ def look_at_patches(
     middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
     size = ti.math.vec3(ends[0] + ends[3], ends[1] + ends[4], ends[2] + ends[5])
     astray = ti.select(vertex_count > 0, ti.sqrt(ends[6]), known_astray)
-    begin_sharing(taken, 0)
+    begin_sharing(counters.taken, 0)
     for worker in range(patches_end):
-        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while m < corners.count:
-            fit_motion(m, still, corners, nodes, patches)
-            budget.moves[m] = (1.0 + SAFETY) * (
-                (patches.motion.shift[m] - middle).norm()
-                + patches.motion.turn[m].norm() * patches.motion.radius[m]
-                + patches.motion.rest[m]
+        m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+        while m < patches.corners.count:
+            fit_motion(m, still, patches.corners, nodes, patches.bounds)
+            patches.budget.moves[m] = (1.0 + SAFETY) * (
+                (patches.bounds.motion.shift[m] - middle).norm()
+                + patches.bounds.motion.turn[m].norm() * patches.bounds.motion.radius[m]
+                + patches.bounds.motion.rest[m]
             )
-            budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
-            if not budget.travel[m] <= budget.reach[m]:
-                counter[2] = 1
-            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
-    begin_sharing(taken, 1)
+            patches.budget.travel[m] = (
+                patches.budget.spent[m] + astray + patches.budget.moves[m] + patches.budget.more[m]
+            )
+            if not patches.budget.travel[m] <= patches.budget.reach[m]:
+                counters.found[2] = 1
+            m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+    begin_sharing(counters.taken, 1)
     for worker in range(pairs_end):
-        end = ti.select(counter[2] == 0, met.count, 0)
-        p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
+        end = ti.select(counters.found[2] == 0, met.count, 0)
+        p = next_item(-1, worker, counters.taken, 1, PAIRS_AT_A_TIME)
         while p < end:
-            age_pair(
-                p, met, patches, budget, thickness, least_skin, astray, first_due, first_due_of_edges, needed, counter
-            )
-            p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)
-    expired = ti.select(counter[2] == 0, counter[0], -1)
-    return ti.math.ivec4(ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, counter[1])
+            age_pair(p, met, patches, ageing, astray, counters.found)
+            p = next_item(p, worker, counters.taken, 1, PAIRS_AT_A_TIME)
+    expired = ti.select(counters.found[2] == 0, counters.found[0], -1)
+    return ti.math.ivec4(
+        ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, counters.found[1]
+    )
 
 
 @func
@@ -325,17 +321,7 @@ def approach_of(m: ti.i32, other: ti.i32, motion: PatchMotion) -> ti.f32:
 
 @func
 def age_pair(
-    p: ti.i32,
-    met: PatchPairArrays,
-    patches: PatchBounds,
-    budget: PatchBudget,
-    thickness: ti.f32,
-    least_skin: ti.f32,
-    astray: ti.f32,
-    first_due: Floats,
-    first_due_of_edges: Floats,
-    needed: Integers,
-    counter: Integers,
+    p: ti.i32, met: PatchPairArrays, patches: MovingPatches, ageing: Ageing, astray: ti.f32, counter: Integers
 ):
     """List a pair of patches if its elements have to be searched before this substep, and if some of them are due.
 
@@ -345,39 +331,44 @@ def age_pair(
         p: number of the pair.
         met: the pairs, with `slack`: how much nearer elements that are not listed may come, and be a thickness apart;
             and `left`: what of it elements that are listed may use up until they are looked at: one that was d apart
-            when the slack was s is due when `left` is below s - d.
-        patches, budget: their motion in this substep.
-        thickness: the largest [m].
-        least_skin: how far beyond to search at least [m].
+            when the slack was s is due when `left` is below s - d. `needed` gets 1 for patches of pairs that are
+            searched.
+        patches: their motion in this substep.
+        ageing: how far to search; what is due of both lists is `NEVER` after this where a pair is due, as those that
+            are looked at get other numbers.
         astray: largest distance of a vertex from where it was left [m].
-        first_due, first_due_of_edges: the largest number that is due of a pair of patches; `NEVER` after this where it
-            is due, as those that are looked at get other ones.
-        needed: gets 1 for patches of pairs that are searched.
         counter: of both lists.
     """
+    thickness = ageing.thickness
     m, other = met.pairs[p][0], met.pairs[p][1]
-    if budget.travel[m] + budget.travel[other] > met.wake[p]:
-        whole, besides = budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other]
-        nearer = ti.min(approach_of(m, other, patches.motion), whole)
-        met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
+    if patches.budget.travel[m] + patches.budget.travel[other] > met.wake[p]:
+        whole, besides = (
+            patches.budget.moves[m] + patches.budget.moves[other],
+            patches.budget.more[m] + patches.budget.more[other],
+        )
+        nearer = ti.min(approach_of(m, other, patches.bounds.motion), whole)
+        met.approach[p], met.allowed[p] = nearer, patches.budget.margin[m] + patches.budget.margin[other]
         met.slack[p] -= 2.0 * astray
         is_searched = False
         if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
-            gap = gap_of_boxes(m, other, patches.low, patches.high) - (1.0 + SAFETY_OF_DUE) * thickness
+            gap = gap_of_boxes(m, other, patches.bounds.low, patches.bounds.high) - (1.0 + SAFETY_OF_DUE) * thickness
             if gap > whole + besides:
-                met.wake[p], met.slack[p] = budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0
+                met.wake[p], met.slack[p] = (
+                    patches.budget.spent[m] + patches.budget.spent[other] + 2.0 * astray + gap,
+                    -1.0,
+                )
                 met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
             else:
-                skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
+                skin = ti.max(ageing.least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
                 met.wake[p], met.slack[p], met.reach[p] = -1.0, skin, thickness + skin
                 is_searched = True
                 met.expired[ti.atomic_add(counter[0], 1)] = p
-                needed[m], needed[other] = 1, 1
+                met.needed[m], met.needed[other] = 1, 1
         if met.wake[p] < 0.0:
             met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
-            if is_searched or first_due[p] >= met.left[p] or first_due_of_edges[p] >= met.left[p]:
+            if is_searched or ageing.first_due[p] >= met.left[p] or ageing.first_due_of_edges[p] >= met.left[p]:
                 met.due[ti.atomic_add(counter[1], 1)] = p
-                first_due[p], first_due_of_edges[p] = NEVER, NEVER
+                ageing.first_due[p], ageing.first_due_of_edges[p] = NEVER, NEVER
 
 
 @func
@@ -411,29 +402,27 @@ def measure_change(
 
 
 @func
-def finish_patch(
-    m: ti.i32, nodes: TrackedNodes, corners: PatchNodes, patches: PatchBounds, budget: PatchBudget, end: SubstepEnd
-):
+def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: SubstepEnd):
     """What a patch used up of the lists in a substep. If contacts changed it by more than `negligible` [m] it is fitted
     anew; its margin for the next substep is `WIDENED` times what they did in this one, and `least_margin` [m] at least.
     """
-    budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
-    budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
-    budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m])
-    budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
-    if budget.change[m] > end.negligible:
-        fit_motion(m, end.still, corners, nodes, patches)
+    patches.budget.change[m] = ti.select(end.is_changed == 1, patches.budget.change[m], 0.0)
+    patches.budget.spent[m] += patches.budget.moves[m] + patches.budget.change[m] + end.astray
+    patches.budget.margin[m] = ti.max(end.least_margin, WIDENED * patches.budget.change[m])
+    patches.budget.more[m] = ti.max(patches.budget.margin[m] - end.half_thickness, 0.0)
+    if patches.budget.change[m] > end.negligible:
+        fit_motion(m, end.still, patches.corners, nodes, patches.bounds)
 
 
 @func
-def finish_pair(p: ti.i32, met: PatchPairArrays, patches: PatchBounds, budget: PatchBudget, negligible: ti.f32):
+def finish_pair(p: ti.i32, met: PatchPairArrays, patches: MovingPatches, negligible: ti.f32):
     """The same of a pair of patches."""
     if met.slack[p] > 0.0:
         m, other = met.pairs[p][0], met.pairs[p][1]
-        nearer = met.approach[p] + budget.change[m] + budget.change[other]
-        if ti.max(budget.change[m], budget.change[other]) > negligible:
-            nearer = approach_of(m, other, patches.motion)
+        nearer = met.approach[p] + patches.budget.change[m] + patches.budget.change[other]
+        if ti.max(patches.budget.change[m], patches.budget.change[other]) > negligible:
+            nearer = approach_of(m, other, patches.bounds.motion)
             # A patch that was not fitted anew moves as noted, but for its change.
-            nearer += ti.select(budget.change[m] > negligible, 0.0, budget.change[m])
-            nearer += ti.select(budget.change[other] > negligible, 0.0, budget.change[other])
+            nearer += ti.select(patches.budget.change[m] > negligible, 0.0, patches.budget.change[m])
+            nearer += ti.select(patches.budget.change[other] > negligible, 0.0, patches.budget.change[other])
         met.slack[p] -= nearer

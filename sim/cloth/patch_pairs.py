@@ -8,14 +8,18 @@ import numpy as np
 import taichi as ti
 
 from sim.cloth.bundles import (
+    Ageing,
     BoxTree,
+    Counters,
     KnownPairs,
+    MovingPatches,
     PairPieces,
     PatchBounds,
     PatchBudget,
     PatchMotion,
     PatchPairArrays,
     SubstepEnd,
+    TestedContacts,
     TrackedNodes,
 )
 from sim.cloth.contact_end import end_contacts
@@ -85,7 +89,7 @@ class PairList:
     @property
     def on_device(self) -> PairPieces:
         """The list for kernels."""
-        return PairPieces(self.pieces, self.piece_due, *self._listed)
+        return PairPieces(self.pieces, self.piece_due, *self._listed, self.again)
 
     @property
     def _listed(self) -> tuple[ti.Ndarray, ...]:
@@ -195,7 +199,9 @@ class PatchPairs:
         self._budget = PatchBudget(*(ti.ndarray(ti.f32, m) for _ in PatchBudget._fields))
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree = BoxTree(patches.leaves, *(ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2)))
+        self._moving = MovingPatches(patches.corner_lists, self.bounds, self._budget)
         self._counter, self._taken = (ti.ndarray(ti.i32, 3) for _ in range(2))
+        self._counters = Counters(self._taken, self._counter)
         self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
         self.needed.fill(0)
@@ -228,6 +234,7 @@ class PatchPairs:
             reach=self.reach,
             due=self.due,
             expired=self.expired,
+            needed=self.needed,
         )
 
     def _tracked(self, state: ClothState) -> TrackedNodes:
@@ -239,7 +246,7 @@ class PatchPairs:
         self._budget.margin.fill(MARGIN * thickness)
         self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
-    def look(self, state: ClothState, *age: float | ti.Ndarray) -> tuple[float, bool]:
+    def look(self, state: ClothState, ageing: Ageing | None = None) -> tuple[float, bool]:
         """Note where patches are and how they move in this substep.
 
         Returns how far vertices get apart from their common motion [m]; and whether the pairs of patches hold for this
@@ -247,9 +254,9 @@ class PatchPairs:
 
         Args:
             state: at the start of the substep.
-            age: as `age` takes them, if the pairs held before.
+            ageing: how, if the pairs held before.
         """
-        return self._look(state, self.patches.vertex_count, *age)
+        return self._look(state, self.patches.vertex_count, ageing)
 
     def meet(self, thickness: float, edge: float, collides: ti.Ndarray, *, keeps: bool = False) -> bool:
         """List the pairs of patches that may get within a thickness [m].
@@ -307,37 +314,30 @@ class PatchPairs:
         self.count = int(found)
         return keeps
 
-    def age(self, state: ClothState, thickness: float, least_skin: float, *first_due: ti.Ndarray) -> int:
+    def age(self, state: ClothState, ageing: Ageing) -> int:
         """Find which pairs have to be searched in this substep, and how far each; returns how many there are.
 
         Args:
             state: at the start of the substep.
-            thickness: distance within which all elements have to be listed [m].
-            least_skin: how far beyond to search at least [m].
-            first_due: `PairList.piece_due` of both lists; `NEVER` after this where a pair is due.
+            ageing: how; `PairList.piece_due` of both lists is `NEVER` after this where a pair is due.
         """
-        self._look(state, 0, thickness, least_skin, *first_due)
+        self._look(state, 0, ageing)
         return self.expired_count
 
-    def _look(self, state: ClothState, vertex_count: int, *age: float | ti.Ndarray) -> tuple[float, bool]:
+    def _look(self, state: ClothState, vertex_count: int, ageing: Ageing | None) -> tuple[float, bool]:
         """Look at the patches unless there are no vertices, then age the pairs unless nothing is said about that."""
         patches = self.patches
         motion, astray, expired, due = look_at_patches(
             vertex_count,
             self._tracked(state),
             self._maxima.over(vertex_count),
-            self._still,
-            patches.corner_lists,
-            self.bounds,
-            self._budget,
-            workers_for(patches.count) if vertex_count else 0,
             self._astray,
+            self._still,
+            self._moving,
             self.on_device,
-            workers_for(self.count) if age else 0,
-            *(age or (0.0, 0.0, self.left, self.left)),
-            self.needed,
-            self._counter,
-            self._taken,
+            ageing or Ageing(0.0, 0.0, self.left, self.left),
+            (workers_for(patches.count) if vertex_count else 0, workers_for(self.count) if ageing else 0),
+            self._counters,
             self._is_short,
         )
         if vertex_count:
@@ -372,21 +372,15 @@ class PatchPairs:
         found: list[int] = end_contacts(
             count,
             contacts.found,
-            contacts.impulse,
-            state.inverse_mass,
-            state.thickness,
-            contacts.crossing,
+            TestedContacts(contacts.impulse, state.inverse_mass, state.thickness, contacts.crossing),
             patches.vertex_count,
             self._tracked(state),
             predicted,
-            patches.corner_lists,
-            self.bounds,
-            self._budget,
+            self._moving,
             SubstepEnd(int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
             self.on_device,
             (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
-            self._taken,
-            self._counter,
+            self._counters,
             self._is_short,
         )
         return found

@@ -52,7 +52,8 @@ class RectangleSprings:
         self._rectangle = rectangle_of(grid, first_node)
         lengths = (grid.rows, grid.columns)
         self._lines = tuple(
-            Lines(axis, lengths[axis], self._strips[axis], self._strips[1 - axis]) for axis in (ALONG_Y, ALONG_X)
+            Lines(lengths[1 - axis], axis, lengths[axis], self._strips[axis], self._strips[1 - axis])
+            for axis in (ALONG_Y, ALONG_X)
         )
         self._steps = (grid.step_y, grid.step_x)
         self._thread_stiffness, self._bend_stiffness = (
@@ -133,14 +134,13 @@ class RectangleSprings:
 
     def excess(self, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
-        state, columns, rows = self._state, self._grid.columns, self._grid.rows
-        across = {ALONG_Y: (columns, columns, 1), ALONG_X: (rows, 1, columns)}
+        state = self._state
+        steps = {ALONG_Y: (self._grid.columns, 1), ALONG_X: (1, self._grid.columns)}
         found = [
             measure_excess_in_lines(
                 self._multipliers,
                 self._blocks.turned,
                 self._lines[axis],
-                lines,
                 self._rectangle.first,
                 node_step,
                 line_step,
@@ -151,7 +151,7 @@ class RectangleSprings:
                 state.nodes,
                 dt * dt,
             )
-            for axis, (lines, node_step, line_step) in across.items()
+            for axis, (node_step, line_step) in steps.items()
         ]
         return max(float(largest) for largest, _ in found), sum(int(count) for _, count in found)
 

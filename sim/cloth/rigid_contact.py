@@ -12,9 +12,8 @@ from sim.cloth.bundles import (
     CollidingBodies,
     Contacts,
     Four,
-    PatchElements,
+    PatchLists,
     PatchMotion,
-    PatchNodes,
     Surface,
     Three,
     Walls,
@@ -64,6 +63,9 @@ AT_CORNER = 0.98
 WITH_EDGES = 2
 """In `CollisionBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one
 point does not hold it: it turns about that."""
+
+NO_BODIES, BODIES, SHOWN_BODIES = range(3)
+"""What there is besides walls: nothing, bodies, bodies of which some may show between vertices."""
 
 Corners = ti.types.matrix(3, 3, ti.f32)
 """Those of a triangle, in rows."""
@@ -117,13 +119,13 @@ class RigidContact:
         self._velocity = np.zeros((len(geometries), 3))
         self._spin_speed = np.zeros(len(geometries))
         self._shows = np.zeros(len(geometries), dtype=bool)
-        self._spacing, self._longest, self._largest_half = 0.0, 0.0, 0.0
+        self._longest, self._largest_half = 0.0, 0.0
         self._taken = ti.ndarray(ti.i32, 2)
         if geometries:
             put(self._advance_on_device, self._advance)
         room = max(len(walls), 1)
         corners = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(4))
-        self._walls = Walls(len(walls), ti.Vector.ndarray(4, ti.f32, room), *corners)
+        self._walls = Walls(len(walls), 0.0, ti.Vector.ndarray(4, ti.f32, room), *corners)
         if walls:
             low, high = np.full((room, 3), -np.inf), np.full((room, 3), np.inf)
             joined = {side: np.zeros((room, 3)) for side in (1.0, -1.0)}
@@ -142,7 +144,7 @@ class RigidContact:
 
     def set_spacing(self, mean_edge: float, longest: float) -> None:
         """Say how long edges of the coarsest cloth are, and the longest of all [m]."""
-        self._spacing, self._longest = mean_edge, longest
+        self._walls, self._longest = self._walls._replace(spacing=mean_edge), longest
 
     def set_thickness(self, least: float, largest: float) -> None:
         """Say how thick cloths are at least and at most [m]: where they can be bodies may show between vertices."""
@@ -227,24 +229,20 @@ class RigidContact:
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
-        lanes = lanes_of_pair()
+        lanes, is_alone = lanes_of_pair(), not (self._walls.count or self.bodies.count)
         found: list[int] = find_rigid_contacts(
-            patches.vertex_lists,
-            patches.elements,
-            lanes,
-            workers_for(patches.count * lanes) if self._walls.count or self.bodies.count else 0,
+            PatchLists(patches.vertex_lists, patches.elements),
+            (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
             self._taken,
             motion,
             self._largest_half,
             state.surface,
             state.inverse_mass,
             self._walls,
-            self._spacing,
             self.bodies.colliding,
             recovery,
             contacts.found,
-            self.bodies.count > 0,
-            bool(self._shows.any()),
+            SHOWN_BODIES if self._shows.any() else BODIES if self.bodies.count else NO_BODIES,
         )
         return found
 
@@ -287,9 +285,7 @@ def fastest_approach(
 
 
 @func
-def touch_wall(
-    i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, spacing: ti.f32, recovery: ti.f32, contacts: Contacts
-):
+def touch_wall(i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: ti.f32, contacts: Contacts):
     """Append a vertex if it reaches a wall.
 
     Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
@@ -299,7 +295,7 @@ def touch_wall(
     distance = n.dot(x) - walls.plane[w].w
     least = least_displacement(distance, half, recovery)
     if distance < half or n.dot(surface.displacement[i]) < least:
-        depth = ti.max(2.0 * WALL_DEPTH * half, spacing, surface.displacement[i].norm())
+        depth = ti.max(2.0 * WALL_DEPTH * half, walls.spacing, surface.displacement[i].norm())
         is_above = (x >= walls.low[w] - depth * walls.joined_low[w]).all()
         is_below = (x <= walls.high[w] + depth * walls.joined_high[w]).all()
         slot = contacts.capacity
@@ -405,48 +401,47 @@ def deepest_on_triangle(y: Corners, in_middle: ti.f32, b: ti.i32, shapes: Shapes
 
 @kernel
 def find_rigid_contacts(
-    listed: PatchNodes,
-    elements: PatchElements,
-    lanes: ti.i32,
-    workers: ti.i32,
+    patches: PatchLists,
+    work: ti.math.ivec2,
     taken: Integers,
     motion: PatchMotion,
     largest_half: ti.f32,
     surface: Surface,
     inverse_mass: Floats,
     walls: Walls,
-    spacing: ti.f32,
     bodies: CollidingBodies,
     recovery: ti.f32,
     contacts: Contacts,
-    are_there: ti.template(),
-    show: ti.template(),
+    meets: ti.template(),
 ) -> ti.math.ivec3:
-    """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if bodies `are_there`,
-    also with these, and if some `show` between vertices, those of triangles, each at its deepest point.
+    """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if cloth `meets` bodies,
+    also with these, and if some show between vertices, those of triangles, each at its deepest point.
 
-    Parallel however few there are: compiled twice, normals would be rounded differently. Returns the numbers of the
-    list's counter, whose first is 0 then.
+    Parallel however few there are: compiled twice, normals would be rounded differently. `work` has the threads that
+    share a patch, and workers (`sim.core.scheduling`). Returns the numbers of the list's counter, whose first is 0
+    then.
     """
-    workers_end = workers
+    lanes, workers_end = work[0], work[1]
     begin_sharing(taken, 0)
     for worker in range(workers_end):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while item < listed.count * lanes:
+        while item < patches.vertices.count * lanes:
             m = item // lanes
             reach = motion.shift[m].norm() + (1.0 + motion.turn[m].norm()) * motion.radius[m] + motion.rest[m]
             for w in range(walls.count):
                 above = walls.plane[w].xyz.dot(motion.centre[m]) - walls.plane[w].w
                 is_near = above < WITH_ROUNDING * (reach + largest_half)
-                place = ti.select(is_near, listed.first[m], listed.first[m + 1]) + item % lanes
-                while place < listed.first[m + 1]:
-                    touch_wall(listed.nodes[place], w, surface, walls, spacing, recovery, contacts)
+                place = ti.select(is_near, patches.vertices.first[m], patches.vertices.first[m + 1]) + item % lanes
+                while place < patches.vertices.first[m + 1]:
+                    touch_wall(patches.vertices.nodes[place], w, surface, walls, recovery, contacts)
                     place += lanes
-            if ti.static(are_there):
+            if ti.static(meets != NO_BODIES):
                 may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-                place = ti.select(may_touch == 1, listed.first[m], listed.first[m + 1]) + item % lanes
-                while place < listed.first[m + 1]:
-                    i = listed.nodes[place]
+                place = (
+                    ti.select(may_touch == 1, patches.vertices.first[m], patches.vertices.first[m + 1]) + item % lanes
+                )
+                while place < patches.vertices.first[m + 1]:
+                    i = patches.vertices.nodes[place]
                     half = 0.5 * surface.thickness[i]
                     for b in range(bodies.count):
                         touch_body(
@@ -466,24 +461,24 @@ def find_rigid_contacts(
                         )
                     place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
-    if ti.static(show):
+    if ti.static(meets == SHOWN_BODIES):
         begin_sharing(taken, 1)
         for worker in range(workers_end):
             item = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
-            while item < elements.count * lanes:
+            while item < patches.elements.count * lanes:
                 m = item // lanes
                 may_touch = may_touch_bodies(m, motion, largest_half, bodies)
                 # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
-                edges = elements.first_edge[m + 1] - elements.first_edge[m]
-                end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
+                edges = patches.elements.first_edge[m + 1] - patches.elements.first_edge[m]
+                end = edges + patches.elements.first_triangle[m + 1] - patches.elements.first_triangle[m]
                 place = ti.select(may_touch == 1, item % lanes, end)
                 while place < end:
                     corners = Three(0)
                     if place < edges:
-                        ends = elements.edges[elements.first_edge[m] + place]
+                        ends = patches.elements.edges[patches.elements.first_edge[m] + place]
                         corners = Three(ends[0], ends[1], ends[1])
                     else:
-                        corners = elements.triangles[elements.first_triangle[m] + place - edges]
+                        corners = patches.elements.triangles[patches.elements.first_triangle[m] + place - edges]
                     for b in range(bodies.count):
                         if bodies.shows[b] > ti.cast(place < edges, ti.i32):
                             touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)

@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import PatchMotion
+from sim.cloth.bundles import Ageing, Boxes, PairLists, PatchBlocks, PatchMotion, Rest
 from sim.cloth.element_blocks import ElementBlocks
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.near_pairs import find_near_pairs
@@ -59,9 +59,10 @@ class SelfCollision:
     def __init__(self, state: ClothState) -> None:
         self._patches = Patches(state.host)
         self._met = PatchPairs(self._patches)
-        self._rest = ti.Vector.ndarray(3, ti.f32, state.vertex_count)
-        self._rest.from_numpy(state.host.position.astype(np.float32))
-        self._blocks = ElementBlocks(self._patches)
+        self._rest = Rest(state.body, ti.Vector.ndarray(3, ti.f32, state.vertex_count))
+        self._rest.position.from_numpy(state.host.position.astype(np.float32))
+        blocks = ElementBlocks(self._patches)
+        self._blocks = PatchBlocks(self._patches.vertex_lists, blocks.triangles, blocks.edges)
         self._collides = ti.ndarray(ti.i32, len(state.names))
         self._ends, self._taken = ti.ndarray(ti.i32, 4), ti.ndarray(ti.i32, 4)
         self.with_triangles, self.of_edges = (
@@ -104,16 +105,16 @@ class SelfCollision:
 
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
-        motion, holds = self._met.look(state, *(() if self._is_forgotten or self._is_outrun else self._age))
+        motion, holds = self._met.look(state, None if self._is_forgotten or self._is_outrun else self._ageing)
         self._is_outrun |= not holds
         return motion
 
     @property
-    def _age(self) -> tuple[float, float, ti.Ndarray, ti.Ndarray]:
-        """As `PatchPairs.age` takes it."""
+    def _ageing(self) -> Ageing:
+        """How pairs of patches are aged."""
         edge = self.mean_edge
         least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        return self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due
+        return Ageing(self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due)
 
     def warm_up(self) -> None:
         """Compile what carries lists over."""
@@ -147,7 +148,7 @@ class SelfCollision:
                 else:
                     pairs.set_pieces(met.capacity)
             self._is_forgotten = self._is_outrun = False
-            met.age(state, *self._age)
+            met.age(state, self._ageing)
         count, lanes, patches = met.expired_count, lanes_of_pair(), self._patches
         met.expired_count, self._searched = 0, self._searched + count
         if not (count or met.due_count or self._lacks_room):
@@ -161,17 +162,10 @@ class SelfCollision:
             ),
             self._taken,
             met.on_device,
-            met.needed,
-            met.bounds.low,
-            met.bounds.high,
-            patches.vertex_lists,
-            self._blocks.triangles,
-            self._blocks.edges,
-            *(pairs.on_device for pairs in lists),
-            *(pairs.again for pairs in lists),
-            self._ends,
+            Boxes(met.bounds.low, met.bounds.high),
+            self._blocks,
+            PairLists(self.with_triangles.on_device, self.of_edges.on_device, self._ends),
             state.surface,
-            state.body,
             self._rest,
             recovery,
             contacts.found,

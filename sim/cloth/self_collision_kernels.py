@@ -3,15 +3,16 @@
 import taichi as ti
 
 from sim.cloth.bundles import (
+    Boxes,
     Contacts,
     EdgeBlocks,
     Four,
     PairPieces,
-    PatchNodes,
+    PatchBlocks,
     PatchPairArrays,
     Quadruples,
+    Rest,
     Surface,
-    TriangleBlocks,
     Two,
 )
 from sim.cloth.proximity import closest_on_edges, closest_on_triangle, distance_of_edges, distance_to_triangle, unit_or
@@ -76,10 +77,10 @@ def share_no_vertex(e: Two, f: Two) -> ti.i32:
 
 
 @func
-def pair_thickness(a: ti.i32, b: ti.i32, cloth: Integers, surface: Surface, at_rest: ti.f32) -> ti.f32:
+def pair_thickness(a: ti.i32, b: ti.i32, rest: Rest, surface: Surface, at_rest: ti.f32) -> ti.f32:
     """Distance that two elements keep [m]: between different cloths, or within one, where it is shorter at rest."""
     wanted = 0.5 * (surface.thickness[a] + surface.thickness[b])
-    return ti.select(cloth[a] == cloth[b], ti.min(wanted, OF_REST_DISTANCE * at_rest), wanted)
+    return ti.select(rest.cloth[a] == rest.cloth[b], ti.min(wanted, OF_REST_DISTANCE * at_rest), wanted)
 
 
 @ti.func
@@ -94,39 +95,37 @@ def pair_vertices_with_triangles(
     lane: ti.i32,
     lanes: ti.i32,
     met: PatchPairArrays,
-    low: Vectors,
-    high: Vectors,
+    boxes: Boxes,
     surface: Surface,
-    vertices: PatchNodes,
-    blocks: TriangleBlocks,
+    blocks: PatchBlocks,
     found: PairPieces,
 ):
     """List the vertices of each of two patches that are near triangles of the other, as one of several threads."""
     soonest = NEVER
     for side in range(2):
         m, other = met.pairs[p][side], met.pairs[p][1 - side]
-        place = vertices.first[m] + lane
-        least, most = low[other] - met.reach[p], high[other] + met.reach[p]
+        place = blocks.vertices.first[m] + lane
+        least, most = boxes.low[other] - met.reach[p], boxes.high[other] + met.reach[p]
         if side == 1 and m == other:
-            place = vertices.first[m + 1]
-        while place < vertices.first[m + 1]:
-            v = vertices.nodes[place]
+            place = blocks.vertices.first[m + 1]
+        while place < blocks.vertices.first[m + 1]:
+            v = blocks.vertices.nodes[place]
             place += lanes
             x = surface.position[v]
             if (x >= least).all() and (x <= most).all():
                 within = met.reach[p] * met.reach[p]
-                for block in range(blocks.first_block[other], blocks.first_block[other + 1]):
+                for block in range(blocks.triangles.first_block[other], blocks.triangles.first_block[other + 1]):
                     near = 0
                     for k in range(BLOCK):
                         t = block * BLOCK + k
-                        dx = ti.max(blocks.low_x[t] - x[0], x[0] - blocks.high_x[t], 0.0)
-                        dy = ti.max(blocks.low_y[t] - x[1], x[1] - blocks.high_y[t], 0.0)
-                        dz = ti.max(blocks.low_z[t] - x[2], x[2] - blocks.high_z[t], 0.0)
+                        dx = ti.max(blocks.triangles.low_x[t] - x[0], x[0] - blocks.triangles.high_x[t], 0.0)
+                        dy = ti.max(blocks.triangles.low_y[t] - x[1], x[1] - blocks.triangles.high_y[t], 0.0)
+                        dz = ti.max(blocks.triangles.low_z[t] - x[2], x[2] - blocks.triangles.high_z[t], 0.0)
                         near |= ti.select(dx * dx + dy * dy + dz * dz <= within, 1, 0) << k
                     while near != 0:
                         t = block * BLOCK + lowest_bit(near)
                         near &= near - 1
-                        corners = blocks.triangles[t]
+                        corners = blocks.triangles.triangles[t]
                         own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
                         if own == 0:
                             a, b = surface.position[corners[0]] - x, surface.position[corners[1]] - x
@@ -148,8 +147,7 @@ def pair_edges(
     lane: ti.i32,
     lanes: ti.i32,
     met: PatchPairArrays,
-    low: Vectors,
-    high: Vectors,
+    boxes: Boxes,
     blocks: EdgeBlocks,
     found: PairPieces,
 ):
@@ -161,7 +159,7 @@ def pair_edges(
     soonest = NEVER
     m, other = met.pairs[p][0], met.pairs[p][1]
     within = met.reach[p] * met.reach[p]
-    least, most = low[other] - met.reach[p], high[other] + met.reach[p]
+    least, most = boxes.low[other] - met.reach[p], boxes.high[other] + met.reach[p]
     place = blocks.first_block[m] * BLOCK + lane
     while place < blocks.first_block[m + 1] * BLOCK:
         e, own = blocks.edges[place], place
@@ -213,13 +211,13 @@ def pair_edges(
 
 
 @func
-def lengthen(p: ti.i32, pieces: Quadruples, again: Integers, ends: Integers, number: ti.template()):
+def lengthen(p: ti.i32, listed: PairPieces, ends: Integers, number: ti.template()):
     """Move a piece to the end of its list, empty, if more was found than it has room for; it is searched `again`."""
-    found = pieces[p][2]
-    if found > pieces[p][1]:
+    found = listed.pieces[p][2]
+    if found > listed.pieces[p][1]:
         places = found + found // 2
-        pieces[p] = Four(ti.atomic_add(ends[number], places), places, 0, 0)
-        again[ti.atomic_add(ends[2 + number], 1)] = p
+        listed.pieces[p] = Four(ti.atomic_add(ends[number], places), places, 0, 0)
+        listed.again[ti.atomic_add(ends[2 + number], 1)] = p
 
 
 @kernel
@@ -264,8 +262,7 @@ def look_at_piece(
     met: PatchPairArrays,
     are_edges: ti.template(),
     surface: Surface,
-    cloth: Integers,
-    rest: Vectors,
+    rest: Rest,
     recovery: ti.f32,
     contacts: Contacts,
 ):
@@ -283,7 +280,6 @@ def look_at_piece(
                 met.allowed[both],
                 are_edges,
                 surface,
-                cloth,
                 rest,
                 recovery,
                 contacts,
@@ -303,8 +299,7 @@ def look_at_pair(
     allowed: ti.f32,
     are_edges: ti.template(),
     surface: Surface,
-    cloth: Integers,
-    rest: Vectors,
+    rest: Rest,
     recovery: ti.f32,
     contacts: Contacts,
 ) -> ti.f32:
@@ -333,9 +328,14 @@ def look_at_pair(
         mean = 0.25 * (u1 + u2 + u3)
         motion = ti.max(mean.norm(), (u1 - mean).norm(), (u2 - mean).norm(), (u3 - mean).norm())
         if wanted[p] == UNKNOWN:
-            a, b, c, d = rest[v[0]], rest[v[1]], rest[v[2]], rest[v[3]]
+            a, b, c, d = (
+                rest.position[v[0]],
+                rest.position[v[1]],
+                rest.position[v[2]],
+                rest.position[v[3]],
+            )
             at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
-            wanted[p] = pair_thickness(v[0], v[2], cloth, surface, at_rest)
+            wanted[p] = pair_thickness(v[0], v[2], rest, surface, at_rest)
         keeps = part * wanted[p]
         if distance < ti.max(keeps, ti.min(2.0 * motion, approach) + allowed):
             across = x1.cross(x3 - x2) if ti.static(are_edges) else (x2 - x1).cross(x3 - x1)

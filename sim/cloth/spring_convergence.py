@@ -68,7 +68,6 @@ def measure_excess_in_lines(
     multipliers: Blocks,
     turned: ti.i32,
     along: Lines,
-    lines: ti.i32,
     first_node: ti.i32,
     node_step: ti.i32,
     line_step: ti.i32,
@@ -85,7 +84,6 @@ def measure_excess_in_lines(
         multipliers: from `solve_lines`, and at the same places.
         turned: first turned block.
         along: the lines.
-        lines: how many there are.
         first_node: of the rectangle.
         node_step, line_step: from a node to the next one of its line, and to the same of the next line.
         stiffness: of the springs of each line [N/m].
@@ -97,7 +95,7 @@ def measure_excess_in_lines(
     """
     ti.loop_config(serialize=True)
     largest, unconverged = 0.0, 0.0
-    for line in range(lines):
+    for line in range(along.count):
         for k in range(along.length - 1):
             block = line // LANES + k * along.strips
             if along.is_turned:

@@ -62,7 +62,15 @@ class ThreadSolver:
         springs.contract(state.nodes, state.displacement)
         for colour in springs.first_colours:
             solve_threads(
-                springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work, self._rows
+                springs.on_device,
+                self._pieces,
+                colour,
+                state.nodes,
+                dt,
+                int(is_first),
+                self._work,
+                self._rows,
+                springs.first_colours.step,
             )
 
     def straighten(self, state: ClothState, dt: float) -> None:
@@ -75,7 +83,15 @@ class ThreadSolver:
         springs = self.springs
         for colour in springs.first_colours:
             straighten_threads(
-                springs.on_device, self._pieces, colour, state.nodes, state.motion, dt, self._work, self._rows
+                springs.on_device,
+                self._pieces,
+                colour,
+                state.nodes,
+                state.motion,
+                dt,
+                self._work,
+                self._rows,
+                springs.first_colours.step,
             )
 
     def excess(self, state: ClothState, dt: float) -> tuple[float, int]:
@@ -151,18 +167,19 @@ def solve_threads(
     is_first: ti.i32,
     work: ThreadWork,
     rows: ti.template(),
+    colours: ti.template(),
 ):
-    """Some colours, from `first` on, with `rows` threads of a GPU for each piece, and each piece exactly:
+    """So many colours, from `first` on, with `rows` threads of a GPU for each piece, and each piece exactly:
 
         (w_s + w_s+1 + a) D_s - w_s n_s-1.n_s D_s-1 - w_s+1 n_s.n_s+1 D_s+1 = -C_s - a l_s,   a = 1/(k dt²)
 
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
     """
-    p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
-    for first_piece, end_piece in ti.static(((p0, p1), (p1, p2), (p2, p3), (p3, p4))):
+    bounds = colour_bounds(pieces.piece_of_colour, first, colours)
+    for colour in ti.static(range(colours)):
         ti.loop_config(block_dim=rows)
-        for row in range(first_piece * rows, end_piece * rows):
+        for row in range(bounds[colour] * rows, bounds[colour + 1] * rows):
             p, k = row // rows, row % rows
             s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
             one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
@@ -221,6 +238,7 @@ def straighten_threads(
     dt: ti.f32,
     work: ThreadWork,
     rows: ti.template(),
+    colours: ti.template(),
 ):
     """Solve (1 + w_i (t_i-1 + t_i)) e_i - w_i t_i-1 e_i-1 - w_i t_i e_i+1 = e~_i in each taut piece of some colours,
     with `rows` threads of a GPU for each, one for each of its nodes.
@@ -228,10 +246,10 @@ def straighten_threads(
     e~ is by how much springs have changed the displacements, e by how much they shall have; t_i is the tension of the
     spring from node i on.
     """
-    p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
-    for first_piece, end_piece in ti.static(((p0, p1), (p1, p2), (p2, p3), (p3, p4))):
+    bounds = colour_bounds(pieces.piece_of_colour, first, colours)
+    for colour in ti.static(range(colours)):
         ti.loop_config(block_dim=rows)
-        for row in range(first_piece * rows, end_piece * rows):
+        for row in range(bounds[colour] * rows, bounds[colour + 1] * rows):
             p, k = row // rows, row % rows
             s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
             one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)

@@ -3,7 +3,6 @@ rectangles and triangles of meshes as many at once.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 
 import numpy as np
 import taichi as ti
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from sim.cloth.angular_momentum import AngularMomentumCorrection
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
-from sim.cloth.device_cells import SHEAR_SWEEPS, DeviceCells, damp_shears, solve_shears
+from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
@@ -113,11 +112,20 @@ class XPBDSprings:
                     state.motion,
                     dt,
                     springs.arity,
+                    springs.first_colours.step,
                 )
         for cells in self._cells:
             if cells.arity != TRIANGLE and cells.is_damped:
                 for colour in cells.first_colours:
-                    damp_shears(cells.on_device, cells.cell_of_colour, colour, state.nodes, state.motion, dt)
+                    damp_shears(
+                        cells.on_device,
+                        cells.cell_of_colour,
+                        colour,
+                        state.nodes,
+                        state.motion,
+                        dt,
+                        cells.first_colours.step,
+                    )
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
@@ -146,16 +154,15 @@ class XPBDSprings:
         for cells in solved:
             if not cloths[list(cells.cloths)].any():
                 continue
-            for time, colour in product(range(SHEAR_SWEEPS if is_first else 1), cells.first_colours):
-                solve_shears(
-                    cells.on_device,
-                    cells.cell_of_colour,
-                    colour,
-                    self._state.nodes,
-                    dt * dt,
-                    int(is_first and time == 0),
-                    cells.multiplier,
-                )
+            solve_shears(
+                cells.on_device,
+                cells.cell_of_colour,
+                self._state.nodes,
+                dt * dt,
+                int(is_first),
+                cells.multiplier,
+                cells.first_colours.stop,
+            )
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
                 threads.displace(self._state, dt, is_first=is_first)
@@ -167,7 +174,14 @@ class XPBDSprings:
         state = self._state
         for colour in springs.first_colours:
             solve_bends(
-                springs.on_device, springs.piece_of_colour, colour, state.nodes, dt * dt, 1.0 / dt, springs.arity
+                springs.on_device,
+                springs.piece_of_colour,
+                colour,
+                state.nodes,
+                dt * dt,
+                1.0 / dt,
+                springs.arity,
+                springs.first_colours.step,
             )
 
 
@@ -213,12 +227,13 @@ def solve_bends(
     dt_squared: ti.f32,
     rate: ti.f32,
     arity: ti.template(),
+    colours: ti.template(),
 ):
-    """The bend springs of some colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
+    """The bend springs of so many colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, colour)
-    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
-        for s in range(start, stop):
+    bounds = colour_bounds(spring_of_colour, colour, colours)
+    for k in ti.static(range(colours)):
+        for s in range(bounds[k], bounds[k + 1]):
             solve_bend(s, springs, nodes, dt_squared, rate, arity)
 
 
@@ -255,11 +270,12 @@ def damp_springs(
     motion: NodeMotion,
     dt: ti.f32,
     arity: ti.template(),
+    colours: ti.template(),
 ):
-    """The springs of some colours, one colour after the other, and one by one within a piece."""
+    """The springs of so many colours, one colour after the other, and one by one within a piece."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    p0, p1, p2, p3, p4 = colour_bounds(piece_of_colour, colour)
-    for start, stop in ti.static(((p0, p1), (p1, p2), (p2, p3), (p3, p4))):
-        for piece in range(start, stop):
+    bounds = colour_bounds(piece_of_colour, colour, colours)
+    for k in ti.static(range(colours)):
+        for piece in range(bounds[k], bounds[k + 1]):
             for s in range(segment_start[piece], segment_start[piece + 1]):
                 damp_spring(s, springs, nodes, motion, dt, arity)

@@ -6,7 +6,6 @@ This relies on Taichi's internals, as `sim.core.launch` does.
 """
 
 import ctypes
-import functools
 import math
 import threading
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from taichi.lang import impl
 from taichi.lang.util import to_numpy_type
 
+from sim.core.cuda_driver import ask
 from sim.core.reductions import runs_on_gpu
 
 _threads = threading.local()
@@ -93,23 +93,10 @@ def _driver_copies() -> bool:
     return knows_context
 
 
-@functools.cache
-def _driver() -> ctypes.CDLL:
-    return ctypes.CDLL("libcuda.so.1")
-
-
 def _ask_driver(function: str, *arguments: ctypes.c_uint64 | ctypes.c_void_p | ctypes.c_ubyte | int) -> None:
-    """Put a copy behind the launches that were asked for, in the stream that Taichi uses.
-
-    Raises:
-        RuntimeError: the driver refuses, or the device has failed.
-    """
+    """Put a copy behind the launches that were asked for, in the stream that Taichi uses."""
     *others, size = arguments
-    code = getattr(_driver(), function)(*others, ctypes.c_size_t(size), None)
-    if code != 0:
-        name = ctypes.c_char_p()
-        _driver().cuGetErrorName(code, ctypes.byref(name))
-        raise RuntimeError(f"{(name.value or b'CUDA_ERROR').decode()} ({code}) in {function}")
+    ask(function, *others, ctypes.c_size_t(size), None)
 
 
 def _memory(array: ti.Ndarray) -> NDArray[np.generic]:

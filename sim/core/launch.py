@@ -2,8 +2,8 @@
 
 Taichi looks at every argument of every call several times. `FastKernel` has Taichi check the types of a call once, and
 hands the arguments of later calls with the same types straight to the runtime, but for fields of bundles that the
-kernel does not read. Most calls come again with the same arrays, which are known by then: on a GPU with what they are
-to the runtime, on a CPU with the whole context of the launch.
+kernel does not read. Most calls come again with the same arrays, for which the whole context of the launch is kept on
+CPUs and with CUDA, and on other GPUs what the arrays are to the runtime.
 Measurements: docs/performance.md.
 
 This relies on Taichi's internals, as `sim.core.bundles`, `sim.core.runtime` and `sim.core.reductions` do; the lock file
@@ -14,8 +14,10 @@ import functools
 import operator
 import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections import namedtuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import taichi as ti
 from taichi.lang import impl
@@ -24,6 +26,7 @@ from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
 
 from sim.core.bundles import field_paths, flattened, is_used, with_fields_as_arguments
+from sim.core.cuda_launch import Graph, HostBuffers, Tasks, tasks_of
 
 _REAL_TYPES = frozenset(primitive_types.real_types)
 
@@ -33,21 +36,30 @@ _tell_compiled: list[Callable[[str, float], None]] = []
 
 MOST_LAUNCHES = 256  # most combinations of arrays whose launch context a kernel keeps
 
+LAUNCHES_BEFORE_GRAPH = 2  # with the same arrays: a graph takes as long to make as some launches
+
+ADDRESS_OF_ARRAY = 1  # place of an array's address among what a kernel gets of it, after its shape
+
 
 def on_compiled(tell: Callable[[str, float], None] | None) -> None:
     """Have `tell(name, seconds)` called after every kernel that had to be compiled in this process; None: nobody."""
     _tell_compiled[:] = [] if tell is None else [tell]
 
 
-class _Launch(NamedTuple):
+@dataclass(eq=False, slots=True)
+class _Launch:
     """What is kept of a launch with these arrays, until one of them is gone."""
 
     compiled: Any
     make_context: Callable[[], Any]
-    context: Any  # on a CPU
+    context: Any  # on a CPU, and with CUDA
     numbers: list[Any]  # what that context has, by argument
-    handles: list[tuple[tuple[int], Any]]  # of the arrays, by place; on a GPU
+    handles: list[tuple[tuple[int], Any]]  # of the arrays, by place; on other GPUs
     arrays: tuple[weakref.ref[Any], ...]
+    tasks: Tasks | None = None  # with CUDA, where they are known
+    buffers: HostBuffers | None = None  # with CUDA
+    graph: Graph | None = None
+    count: int = 0  # of launches before there is a graph
 
 
 def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: object) -> None:
@@ -55,12 +67,26 @@ def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: o
     launches.pop(key, None)
 
 
-def _getter(paths: list[str]) -> Callable[[Any], Iterable[Any]]:
-    """A function that returns the values at dotted paths in a bundle, in order."""
-    if len(paths) > 1:
-        return operator.attrgetter(*paths)
-    get = operator.attrgetter(*paths)
-    return lambda value: (get(value),)
+def _picker(read: Sequence[str], count: int) -> Callable[[Sequence[Any]], Sequence[Any]]:
+    """A function of `count` arguments that returns what a kernel reads of them, in order.
+
+    Args:
+        read: its paths, as "argument_2.field".
+        count: of the arguments.
+    """
+    if list(read) == [_name_of(number) for number in range(count)]:
+        return lambda arguments: arguments
+    arguments_of: Any = namedtuple("Arguments", [_name_of(number) for number in range(count)])
+    if len(read) > 1:
+        get = operator.attrgetter(*read)
+        return lambda arguments: get(arguments_of(*arguments))
+    getters = [operator.attrgetter(path) for path in read]
+    return lambda arguments: [get(arguments_of(*arguments)) for get in getters]
+
+
+def _name_of(number: int, field: str = "") -> str:
+    """Path of an argument, or of a field of it."""
+    return f"argument_{number}.{field}" if field else f"argument_{number}"
 
 
 class FastKernel:
@@ -76,12 +102,11 @@ class FastKernel:
     def __init__(self, kernel: Any) -> None:
         functools.update_wrapper(self, kernel)
         self._primal = kernel._primal
-        self._has_bundles = hasattr(self._primal.func, "__bundles__")
         self._kinds = getattr(self._primal.func, "__bundles__", (None,) * len(self._primal.arguments))
         self._program: Any = None
-        self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
+        self._compiled: dict[tuple[Any, ...], tuple[Any, Any, Tasks | None]] = {}
         self._launches: dict[tuple[Any, ...], _Launch] = {}
-        self._on_cpu = False
+        self._on_cpu = self._on_cuda = False
         self._sort_arguments()
 
     def __call__(self, *args: Any) -> Any:
@@ -89,8 +114,9 @@ class FastKernel:
         program = impl.get_runtime().prog
         if program is not self._program:
             self._program, self._compiled, self._launches = program, {}, {}
-            self._on_cpu = impl.current_cfg().arch in (ti.x64, ti.arm64)
-        used = self._used(args) if self._has_bundles else args
+            arch = impl.current_cfg().arch
+            self._on_cpu, self._on_cuda = arch in (ti.x64, ti.arm64), arch == ti.cuda
+        used = self._used(args)
         arrays = [used[index] for index, _ in self._arrays]
         key = (*[used[index] for index in self._templates], *map(id, arrays))
         launch = self._launches.get(key)
@@ -99,48 +125,50 @@ class FastKernel:
             if compiled is None:
                 return self._first_call(program, args)
             launch = self._launches[key] = self._kept(program, key, compiled, arrays, len(used))
-        if self._on_cpu:
-            return self._launch(program, launch.compiled, launch.context, used, launch.numbers)
-        context = launch.make_context()  # it does not outlive the launch
-        for place, handle in launch.handles:
-            context.set_arg_ndarray(place, handle)
-        return self._launch(program, launch.compiled, context, used, [None] * len(used))
+        return self._launch(program, launch, used)
 
     def _kept(
-        self, program: Any, key: tuple[Any, ...], compiled: tuple[Any, Any], arrays: Sequence[Any], used: int
+        self,
+        program: Any,
+        key: tuple[Any, ...],
+        compiled: tuple[Any, Any, Tasks | None],
+        arrays: Sequence[Any],
+        used: int,
     ) -> _Launch:
         """What is worth keeping of a launch.
 
         On a CPU arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in
-        every launch.
+        every launch. With CUDA it does so unless it has no size of them; addresses are put where it would have them.
         """
-        kernel, executable = compiled
-        context, handles = None, []
-        if self._on_cpu:
+        kernel, executable, tasks = compiled
+        context, buffers, handles = None, None, []
+        if self._on_cpu or self._on_cuda:
             context = kernel.make_launch_context()
             for (_, place), array in zip(self._arrays, arrays, strict=True):
-                size = array.arr.nelement() * array.arr.element_size()
                 address = program.get_ndarray_data_ptr_as_int(array.arr)
-                context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
+                if self._on_cpu:
+                    size = array.arr.nelement() * array.arr.element_size()
+                    context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
+                    continue
+                context.set_struct_arg_uint((*place, ADDRESS_OF_ARRAY), address)
+                for axis, length in enumerate(array.shape):
+                    context.set_struct_arg_int((*place, 0, axis), length)
+            buffers = HostBuffers(context) if self._on_cuda else None
         else:
             handles = [(place, array.arr) for (_, place), array in zip(self._arrays, arrays, strict=True)]
         if len(self._launches) >= MOST_LAUNCHES:
             self._launches.clear()
         forget = functools.partial(_forget, self._launches, key)
         references = tuple(weakref.ref(array, forget) for array in arrays)
-        return _Launch(executable, kernel.make_launch_context, context, [None] * used, handles, references)
+        make_context = kernel.make_launch_context
+        return _Launch(executable, make_context, context, [None] * used, handles, references, tasks, buffers)
 
-    def _used(self, args: tuple[Any, ...]) -> list[Any]:
+    def _used(self, args: tuple[Any, ...]) -> Sequence[Any]:
         """Arguments that the kernel reads, fields of bundles among them. Raises TypeError where a bundle is another."""
-        used: list[Any] = []
-        for value, kind, fields in zip(args, self._kinds, self._fields, strict=True):
-            if kind is None:
-                used.append(value)
-            elif type(value) is not kind:
-                raise TypeError(f"{self.__name__} takes a {kind.__name__}, got a {type(value).__name__}")
-            elif fields is not None:
-                used += fields(value)
-        return used
+        for number, kind in self._bundles:
+            if type(args[number]) is not kind:
+                raise TypeError(f"{self.__name__} takes a {kind.__name__}, got a {type(args[number]).__name__}")
+        return self._pick(args)
 
     def _key(self, used: Sequence[Any]) -> tuple[Any, ...]:
         """What a kernel is compiled for: compile-time values, and the types of arrays."""
@@ -158,21 +186,40 @@ class FastKernel:
         if ended - traced > SLOW_S:
             for tell in _tell_compiled:
                 tell(self.__name__, ended - began)
-        result = self._primal(*flat)
+        tasks = None
+        if self._on_cuda:
+            result, tasks = tasks_of(self.__name__, lambda: self._primal(*flat))
+        else:
+            result = self._primal(*flat)
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
             self._sort_arguments()
-        self._compiled[self._key(self._used(args) if self._has_bundles else args)] = kernel, compiled
+        self._compiled[self._key(self._used(args))] = kernel, compiled, tasks
         return result.to_numpy().tolist() if self._returns_vector else result
 
-    def _launch(self, program: Any, compiled: Any, context: Any, used: Sequence[Any], passed: list[Any]) -> Any:
-        """Launch with arrays that the context has, and these numbers, of which it has those that are `passed`."""
-        self._pass_numbers(context, used, passed)
-        program.launch_kernel(compiled, context)
+    def _launch(self, program: Any, launch: _Launch, used: Sequence[Any]) -> Any:
+        """Launch with arrays that are kept and the numbers among what is `used`."""
+        context, passed = launch.context, launch.numbers
+        if context is None:
+            context, passed = launch.make_context(), [None] * len(used)  # it does not outlive the launch
+            for place, handle in launch.handles:
+                context.set_arg_ndarray(place, handle)
+        elif launch.buffers is not None and launch.graph is None:
+            launch.buffers.restore()
+            if launch.tasks is not None and launch.count >= LAUNCHES_BEFORE_GRAPH:
+                launch.graph = Graph(launch.tasks, launch.buffers)
+            launch.count += 1
+        is_changed = self._pass_numbers(context, used, passed)
+        if launch.graph is None:
+            program.launch_kernel(launch.compiled, context)
+        else:
+            launch.graph.launch(is_changed=is_changed)
         if self._primal.return_type is None:
             return None
         if not self._on_cpu:
             program.synchronize()
+            if launch.graph is not None:
+                launch.graph.take_result()
         kind = self._primal.return_type[0]
         if self._returns_vector:
             get = context.get_struct_ret_float if kind.dtype in _REAL_TYPES else context.get_struct_ret_int
@@ -187,12 +234,12 @@ class FastKernel:
         self._integers: list[tuple[int, tuple[int]]] = []
         self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
         self._integer_vectors: list[tuple[int, list[tuple[int, int]]]] = []
-        self._fields: list[Callable[[Any], Iterable[Any]] | None] = [None] * len(self._kinds)
+        self._bundles = [(number, kind) for number, kind in enumerate(self._kinds) if kind is not None]
+        read: list[str] = []
         arguments = iter(enumerate(self._primal.arguments))
         count = 0
         for number, kind in enumerate(self._kinds):
             paths = [""] if kind is None else list(field_paths(kind))
-            read = []
             for path, (place, argument) in zip(paths, arguments, strict=False):
                 is_template = isinstance(argument.annotation, ti.template)
                 if not (is_template or is_used(self._primal.func, argument.name)):
@@ -201,10 +248,9 @@ class FastKernel:
                     self._templates.append(count)
                 else:
                     self._sort_argument(count, place - len(self._templates), argument.annotation)
-                read.append(path)
+                read.append(_name_of(number, path))
                 count += 1
-            if kind is not None and read:
-                self._fields[number] = _getter(read)
+        self._pick = _picker(read, len(self._kinds))
         self._used_count = len(getattr(self._primal.func, "__used__", ()))
 
     def _sort_argument(self, index: int, place: int, annotation: Any) -> None:
@@ -224,22 +270,30 @@ class FastKernel:
     def _returns_vector(self) -> bool:
         return self._primal.return_type is not None and isinstance(self._primal.return_type[0], VectorType)
 
-    def _pass_numbers(self, context: Any, used: Sequence[Any], passed: list[Any]) -> None:
-        """Numbers that are the same objects as those passed before are there already."""
-        for index, place in self._floats:
-            if used[index] is not passed[index]:
-                context.set_arg_float(place, used[index])
-                passed[index] = used[index]
-        for index, place in self._integers:
-            if used[index] is not passed[index]:
-                context.set_arg_int(place, used[index])
-                passed[index] = used[index]
-        for index, places in self._float_vectors:
-            for place, component in zip(places, used[index], strict=True):
-                context.set_struct_arg_float(place, component)
-        for index, places in self._integer_vectors:
-            for place, component in zip(places, used[index], strict=True):
-                context.set_struct_arg_int(place, component)
+    def _pass_numbers(self, context: Any, used: Sequence[Any], passed: list[Any]) -> bool:
+        """Pass numbers to a context that has those that were `passed` before; returns whether any differ."""
+        is_changed = False
+        for numbers, set_number in ((self._floats, context.set_arg_float), (self._integers, context.set_arg_int)):
+            for index, place in numbers:
+                if used[index] is not passed[index] and not _is_same(used[index], passed[index]):
+                    set_number(place, used[index])
+                    passed[index], is_changed = used[index], True
+        for vectors, set_component in (
+            (self._float_vectors, context.set_struct_arg_float),
+            (self._integer_vectors, context.set_struct_arg_int),
+        ):
+            for index, places in vectors:
+                if used[index] is not passed[index]:
+                    for place, component in zip(places, used[index], strict=True):
+                        set_component(place, component)
+                    # Other vectors than tuples may be the same object with other numbers next time.
+                    passed[index], is_changed = used[index] if type(used[index]) is tuple else None, True
+        return is_changed
+
+
+def _is_same(number: Any, before: Any) -> bool:
+    """Whether a number is certainly the one before, bit by bit: 0.0 equals -0.0."""
+    return type(number) is type(before) and number == before and (type(number) is int or number != 0.0)
 
 
 def kernel(function: Callable[..., Any]) -> FastKernel:

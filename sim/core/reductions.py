@@ -6,11 +6,12 @@ on the kind of device alone, each with its own share of the numbers, and a tree 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from taichi.lang import impl
 
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import bundle, func
@@ -100,7 +101,14 @@ class LaneReduction:
 
 def runs_on_gpu() -> bool:
     """Whether Taichi, which must have been started, runs on a GPU."""
-    return ti.lang.impl.current_cfg().arch not in (ti.x64, ti.arm64)
+    program = impl.get_runtime().prog
+    if program is not _asked.get("program"):
+        _asked.update(program=program, on_gpu=impl.current_cfg().arch not in (ti.x64, ti.arm64))
+    return bool(_asked["on_gpu"])
+
+
+_asked: dict[str, Any] = {}
+"""What `runs_on_gpu` answered last, and of which program of Taichi: it is asked a dozen times in a substep."""
 
 
 def device_lanes() -> Lanes:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
-from sim.cloth.device_springs import COLOURS_AT_ONCE
 from sim.cloth.threads import LEAST_ALIKE, STRAIGHTENED, TURNED_EXPLICITLY
 
 Floats = NDArray[np.float64]
@@ -22,13 +21,14 @@ def solve_threads(
     is_first: int,
     work: ThreadWork,
     _rows: int,
+    colours: int,
 ) -> None:
     lattice, w, u = (read(array) for array in (nodes.lattice, nodes.inverse_mass, nodes.displacement))
     law, shift, multiplier, tension = (
         read(each) for each in (springs.law, springs.shift, work.multiplier, work.tension)
     )
     taut = pieces.is_taut.to_numpy()
-    for piece, own, chain in pieces_of(springs, pieces, first):
+    for piece, own, chain in pieces_of(springs, pieces, first, colours):
         at_start = -nodes.quantum * np.diff(lattice[chain], axis=0)
         d = at_start - np.diff(u[chain], axis=0)
         length, start_length = (np.linalg.norm(each, axis=1) for each in (d, at_start))
@@ -63,10 +63,11 @@ def straighten_threads(
     dt: float,
     work: ThreadWork,
     _rows: int,
+    colours: int,
 ) -> None:
     w, u, tension = (read(array) for array in (nodes.inverse_mass, nodes.displacement, work.tension))
     predicted = read(motion.carry) + dt * read(motion.velocity)
-    for piece, own, chain in pieces_of(springs, pieces, first):
+    for piece, own, chain in pieces_of(springs, pieces, first, colours):
         if pieces.is_taut[piece]:
             change = np.where(w[chain, None] > 0.0, u[chain] - predicted[chain], 0.0)
             t = tension[own]
@@ -80,10 +81,12 @@ def read(array: Any) -> Floats:
     return values
 
 
-def pieces_of(springs: SpringArrays, pieces: Pieces, first: int) -> Iterator[tuple[int, slice, NDArray[np.int32]]]:
+def pieces_of(
+    springs: SpringArrays, pieces: Pieces, first: int, colours: int
+) -> Iterator[tuple[int, slice, NDArray[np.int32]]]:
     """Number, springs and nodes of each piece of some colours, one after the other."""
     starts, piece_of_colour = pieces.segment_start.to_numpy(), pieces.piece_of_colour.to_numpy()
     ends = springs.nodes.to_numpy().reshape(-1, 2)
-    for piece in range(piece_of_colour[first], piece_of_colour[first + COLOURS_AT_ONCE]):
+    for piece in range(piece_of_colour[first], piece_of_colour[first + colours]):
         own = slice(starts[piece], starts[piece + 1])
         yield piece, own, np.append(ends[own, 0], ends[own][-1, 1])

@@ -8,6 +8,7 @@ import taichi as ti
 from cloth_scenes import WEIGHTLESS, cloth, rectangle, solver_of
 from contact_scenes import find, listed_pairs, listed_places
 
+from sim.cloth.bundles import Ageing
 from sim.cloth.patch_pairs import PatchPairs
 from sim.cloth.patches import TRIANGLES_PER_PATCH, Patches
 from sim.cloth.proximity_contacts import ContactList
@@ -76,7 +77,7 @@ def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     collides.fill(1)
     met.meet(1.0, 1.0, collides)
     # All are searched: none are so far apart that they might sleep.
-    assert met.age(state, 1.0, 0.0, *nothing_due(met)) == met.count
+    assert met.age(state, Ageing(1.0, 0.0, *nothing_due(met))) == met.count
     assert met.count == patches.count * (patches.count + 1) // 2
     corners = pieces(patches.corners, patches.first_corner)
     return met.approach.to_numpy()[: met.count], met.pairs.to_numpy()[: met.count], corners

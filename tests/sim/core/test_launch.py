@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 import taichi as ti
+from taichi.lang import impl
 
-from sim.core.launch import MOST_LAUNCHES, FastKernel, kernel, on_compiled
+from sim.core import cuda_launch
+from sim.core.launch import LAUNCHES_BEFORE_GRAPH, MOST_LAUNCHES, FastKernel, kernel, on_compiled
 
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 AnyNumbers = ti.types.ndarray(ndim=1)
@@ -21,6 +23,11 @@ def fill(
             value *= factor
         numbers[i] = value + shift[0] + 10.0 * shift[1] + 100.0 * shift[2] + cell[0] + 10 * cell[1] + 100 * cell[2]
     return count + cell[2]
+
+
+@kernel
+def place(numbers: Floats, value: ti.f32):
+    numbers[0] = value
 
 
 @kernel
@@ -79,6 +86,35 @@ def test_calls_that_come_again_write_to_the_arrays_of_the_call(taichi_cpu):
             halve(halved)
             np.testing.assert_array_equal(halved.to_numpy(), length / 2**power)
         del halved
+
+
+def test_numbers_that_are_equal_but_not_the_same_are_passed(taichi_cpu):
+    numbers = ti.ndarray(ti.f32, 2)
+    for value in (0.0, -0.0, 0.0, 2.5, float("2.5"), float("nan"), float("nan"), -0.0):
+        numbers.fill(1.0)
+        place(numbers, value)
+        assert repr(float(numbers.to_numpy()[0])) == repr(value)
+
+
+def test_with_cuda_calls_that_come_again_are_graphs(taichi_cpu):
+    @kernel
+    def count_up(numbers: Floats, by: ti.f32) -> ti.f32:
+        for i in range(numbers.shape[0]):
+            numbers[i] += by
+        for i in range(numbers.shape[0]):
+            numbers[i] *= 2.0
+        return numbers[1]
+
+    numbers, expected = ti.ndarray(ti.f32, 3), 0.0
+    numbers.fill(0.0)
+    for call in range(LAUNCHES_BEFORE_GRAPH + 4):
+        by = 0.5 * (call // 2)
+        expected = 2.0 * (expected + by)
+        assert count_up(numbers, by) == expected
+    np.testing.assert_array_equal(numbers.to_numpy(), expected)
+    (launch,) = count_up._launches.values()
+    has_graphs = impl.current_cfg().arch == ti.cuda and cuda_launch._compiling_thread() is not None
+    assert (launch.graph is not None) == has_graphs
 
 
 def test_a_kernel_forgets_calls_rather_than_remember_ever_more(taichi_cpu):
