@@ -44,7 +44,7 @@ def end_contacts(
     Args:
         count, contacts, impulse, inverse_mass, thickness, crossing: see `repair_crossing`.
         vertex_count, nodes, corners: the vertices, and those of each patch.
-        predicted: displacements before contacts [m].
+        predicted: displacements as contacts were looked for [m].
         patches, budget, end, met: see `finish_patch` and `finish_pair`.
         workers, taken: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
         counter: three integers to count with.

@@ -47,9 +47,6 @@ LEAST_GAP = 0.02
 KEPT_BY_REPAIR = 0.3
 """Share of its separation that a pair keeps which would have crossed: above 1 - `LARGEST_SHARE`."""
 
-FIRST_OF_ROUND, FIRST_OF_SUBSTEP = 1, 2
-"""Pushes that forget the impulses of what was found before; and that note what displacements are without contacts."""
-
 ALONE = -1
 """In the place of the first use of a vertex: what stands touches it, and nothing else does."""
 
@@ -87,8 +84,8 @@ def weigh_contacts(
     is_first: ti.i32,
     is_short: ti.template(),
 ):
-    """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses, and
-    keep what displacements were `predicted` without contacts.
+    """List the contacts that push, and compute their diagonal D; before the first round of what was found, forget their
+    impulses, and keep what displacements were `predicted` as it was looked for.
 
     `counter` gets how many there are, and how many vertices they push, which are listed too. Contacts whose free
     vertices weigh less than `LEAST_FREE_WEIGHT` do not push.
@@ -113,7 +110,7 @@ def weigh_contacts(
     for i in range(all_end):
         if i < vertex_count:
             sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
-            if is_first == FIRST_OF_SUBSTEP:
+            if is_first == 1:
                 sums.predicted[i] = nodes.displacement[i]
             if bodies.may_move == 1:
                 sums.lever[i], sums.pressing_body[i] = 0.0, -1
@@ -167,7 +164,7 @@ def weigh_contacts(
         ti.loop_config(serialize=True)
     for c in range(contacts_end):
         if impulses.mobility[c] > 0.0:
-            if is_first > 0:
+            if is_first == 1:
                 impulses.impulse[c] = ti.math.vec3(0.0)
             v = contacts.vertices[c][0]
             if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):

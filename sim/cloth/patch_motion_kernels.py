@@ -39,6 +39,9 @@ PATCHES_AT_A_TIME, PAIRS_AT_A_TIME = 16, 256
 WIDENED = 1.25
 """Contacts may push so many times as far as in the substep before without patches being looked at anew."""
 
+KEPT_MARGIN = 0.97
+"""Part of what they may that they keep for the next substep, whatever they did: what one pushes swings about a mean."""
+
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
@@ -415,11 +418,12 @@ def finish_patch(
     m: ti.i32, nodes: TrackedNodes, corners: PatchNodes, patches: PatchBounds, budget: PatchBudget, end: SubstepEnd
 ):
     """What a patch used up of the lists in a substep. If contacts changed it by more than `negligible` [m] it is fitted
-    anew; its margin for the next substep is `WIDENED` times what they did in this one, and `least_margin` [m] at least.
+    anew; its margin for the next substep is `WIDENED` times what they did in this one, `KEPT_MARGIN` times what it was,
+    and `least_margin` [m] at least.
     """
     budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
     budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
-    budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m])
+    budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m], KEPT_MARGIN * budget.margin[m])
     budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
     if budget.change[m] > end.negligible:
         fit_motion(m, end.still, corners, nodes, patches)
