@@ -3,7 +3,7 @@
 import taichi as ti
 
 from sim.cloth.bundles import Contacts, PatchBounds, PatchBudget, PatchNodes, PatchPairArrays, SubstepEnd, TrackedNodes
-from sim.cloth.continuous_response import repair_crossing
+from sim.cloth.crossing_repair import repair_crossing
 from sim.cloth.patch_motion_kernels import (
     PAIRS_AT_A_TIME,
     PATCHES_AT_A_TIME,

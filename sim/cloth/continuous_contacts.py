@@ -14,7 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import NodeSums, PatchMotion, PushedNodes
-from sim.cloth.continuous_response import STEPS, begin_push, push_on
+from sim.cloth.contact_iteration import STEPS
+from sim.cloth.continuous_response import begin_push, push_on
 from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
