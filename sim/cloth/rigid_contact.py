@@ -98,8 +98,9 @@ class BodyMotion:
 class RigidContact:
     """Finds where cloth touches bodies and walls.
 
-    Cloth stays half its thickness away from both. Its vertices are looked at, and where a body may show between them,
-    as it is sharp, small or thinly covered (`CollisionBodies.sag`), the deepest point of each triangle.
+    Cloth stays half its thickness away from both. Its vertices are looked at, which keep a little more where a round
+    body would show a little between them (`CollisionBodies.lift`); and where it may show more, as it is sharp, small or
+    thinly covered (`CollisionBodies.sag`), the deepest point of each triangle.
     The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
     by less than `LARGEST_ADVANCE` (`stable_dt`).
 
