@@ -491,7 +491,7 @@ class PushedNodes(NamedTuple):
     reached: Vectors  # displacement without momentum [m], (n,)
     touched: Integers  # numbers of those that contacts push
     uses: Integers  # first and last place of each node in `Impulses.used_by`, (2 n,)
-    support: Vectors  # see `continuous_response`, (n,)
+    support: Vectors  # see `contact_supports`, (n,)
 
 
 @bundle
@@ -499,7 +499,7 @@ class NodeSums(NamedTuple):
     """Numbers of each node that are found as contacts are weighed."""
 
     counter: Integers  # contacts that push, their nodes, and uses; whether any misses much, is settled, (5,)
-    predicted: Vectors  # displacement without contacts [m], (n,)
+    predicted: Vectors  # displacement as contacts were looked for [m], (n,)
     shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
     held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)
     lever: Floats  # square root of the largest mobility of a body that presses [kg^(-1/2)], (n,)
@@ -535,6 +535,7 @@ class CollidingBodies(NamedTuple):
     radius: Floats  # [m]
     step: Floats  # [m]
     friction: Floats  # [-]
+    lift: Floats  # [m]
     position: Vectors  # [m]
     rotation: Matrices
     motion: Vectors  # [m] and [rad] in turn, (2 b,)

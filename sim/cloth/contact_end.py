@@ -12,7 +12,7 @@ from sim.cloth.bundles import (
     TestedContacts,
     TrackedNodes,
 )
-from sim.cloth.continuous_response import repair_crossing
+from sim.cloth.crossing_repair import repair_crossing
 from sim.cloth.patch_motion_kernels import (
     PAIRS_AT_A_TIME,
     PATCHES_AT_A_TIME,
@@ -47,7 +47,7 @@ def end_contacts(
     Args:
         count, contacts, tested: see `repair_crossing`.
         vertex_count, nodes: the vertices.
-        predicted: displacements before contacts [m].
+        predicted: displacements as contacts were looked for [m].
         patches, end, met: see `finish_patch` and `finish_pair`.
         workers: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
         counters: three numbers.

@@ -15,7 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import NodeSums, PatchMotion, PushedNodes
-from sim.cloth.continuous_response import FIRST_OF_ROUND, FIRST_OF_SUBSTEP, STEPS, begin_push, push_on
+from sim.cloth.contact_iteration import STEPS
+from sim.cloth.continuous_response import begin_push, push_on
 from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
@@ -231,12 +232,10 @@ class ContinuousContacts:
         if not self._is_warm:
             self._warm_up(state)
             self._is_warm = True
-        first = FIRST_OF_SUBSTEP
         while True:
             found = self._find(state, dt)
             if found:
-                self._push(state, found, first=first, relax=relax)
-                first = FIRST_OF_ROUND
+                self._push(state, found, is_first=True, relax=relax)
             left, is_beyond, not_finite = self._keep_apart(state, found)
             if not_finite:
                 return  # as above
@@ -252,7 +251,7 @@ class ContinuousContacts:
     def _warm_up(self, state: ClothState) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
         for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
-            self._begin_push(state, 0, first=FIRST_OF_SUBSTEP, short=short)
+            self._begin_push(state, 0, is_first=True, short=short)
             self._push_on(0, 0, 0, short=short)
         if self._meets_cloth:
             self._pairs.warm_up()
@@ -267,22 +266,22 @@ class ContinuousContacts:
                 return found
 
     def _push(
-        self, state: ClothState, count: int, *, first: int = 0, relax: Callable[[], bool] = lambda: False
+        self, state: ClothState, count: int, *, is_first: bool = False, relax: Callable[[], bool] = lambda: False
     ) -> None:
         """Push; first in turns with the springs, for as long as these `relax`."""
         short = self._is_short(count)
         while True:
-            pushing, touched, is_missing, settled = self._begin_push(state, count, first=first, short=short)
+            pushing, touched, is_missing, settled = self._begin_push(state, count, is_first=is_first, short=short)
             self._iterations += STEPS if pushing else settled
             if not (pushing or settled) or not relax():
                 break
-            first = 0
+            is_first = False
         if pushing and is_missing:
             for step in range(0, MORE_ITERATIONS, STEPS):
                 self._push_on(pushing, touched, step, short=short)
             self._iterations += MORE_ITERATIONS
 
-    def _begin_push(self, state: ClothState, count: int, *, first: int, short: bool) -> list[int]:
+    def _begin_push(self, state: ClothState, count: int, *, is_first: bool, short: bool) -> list[int]:
         """A round of the first `STEPS` steps; what `begin_push` returns."""
         contacts = self._contacts
         found: list[int] = begin_push(
@@ -295,7 +294,7 @@ class ContinuousContacts:
             self._sums,
             state.thickness,
             self.rigid.bodies.pushed,
-            first,
+            int(is_first),
             short,
         )
         return found

@@ -42,6 +42,9 @@ PATCHES_AT_A_TIME, PAIRS_AT_A_TIME = 16, 256
 WIDENED = 1.25
 """Contacts may push so many times as far as in the substep before without patches being looked at anew."""
 
+KEPT_MARGIN = 0.97
+"""Part of what they may that they keep for the next substep, whatever they did: what one pushes swings about a mean."""
+
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
@@ -404,11 +407,13 @@ def measure_change(
 @func
 def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: SubstepEnd):
     """What a patch used up of the lists in a substep. If contacts changed it by more than `negligible` [m] it is fitted
-    anew; its margin for the next substep is `WIDENED` times what they did in this one, and `least_margin` [m] at least.
+    anew; its margin for the next substep is `WIDENED` times what they did in this one, `KEPT_MARGIN` times what it was,
+    and `least_margin` [m] at least.
     """
     patches.budget.change[m] = ti.select(end.is_changed == 1, patches.budget.change[m], 0.0)
     patches.budget.spent[m] += patches.budget.moves[m] + patches.budget.change[m] + end.astray
-    patches.budget.margin[m] = ti.max(end.least_margin, WIDENED * patches.budget.change[m])
+    foreseen = ti.max(WIDENED * patches.budget.change[m], KEPT_MARGIN * patches.budget.margin[m])
+    patches.budget.margin[m] = ti.max(end.least_margin, foreseen)
     patches.budget.more[m] = ti.max(patches.budget.margin[m] - end.half_thickness, 0.0)
     if patches.budget.change[m] > end.negligible:
         fit_motion(m, end.still, patches.corners, nodes, patches.bounds)

@@ -362,7 +362,7 @@ class PatchPairs:
 
         Args:
             state: at the end of its displacements.
-            predicted: displacements without contacts.
+            predicted: displacements as contacts were looked for.
             contacts: in the substep.
             count: of those that are tested.
             negligible: what contacts may add without the motion of patches being looked at anew [m].

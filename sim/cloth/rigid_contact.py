@@ -54,6 +54,10 @@ step, if that is more: what left through an open face falls on outside."""
 OF_TRIANGLES = 0.75
 """Part of their distance from bodies that triangles keep between their vertices, which alone push flat bodies then."""
 
+LARGEST_LIFT = 0.25
+"""How much farther from a round body than half their thickness vertices may be kept, in thicknesses, so that it does
+not show between them: triangles need not be looked at, which have four times the contacts."""
+
 SEARCH_LEVELS = 5
 """How often the deepest point of a triangle is looked for around the last: to a 24th of its edges."""
 
@@ -96,8 +100,9 @@ class BodyMotion:
 class RigidContact:
     """Finds where cloth touches bodies and walls.
 
-    Cloth stays half its thickness away from both. Its vertices are looked at, and where a body may show between them,
-    as it is sharp, small or thinly covered (`CollisionBodies.sag`), the deepest point of each triangle.
+    Cloth stays half its thickness away from both. Its vertices are looked at, which keep a little more where a round
+    body would show a little between them (`CollisionBodies.lift`); and where it may show more, as it is sharp, small or
+    thinly covered (`CollisionBodies.sag`), the deepest point of each triangle.
     The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
     by less than `LARGEST_ADVANCE` (`stable_dt`).
 
@@ -148,8 +153,11 @@ class RigidContact:
 
     def set_thickness(self, least: float, largest: float) -> None:
         """Say how thick cloths are at least and at most [m]: where they can be bodies may show between vertices."""
-        self._largest_half = 0.5 * largest
-        shows = self.bodies.sag(self._longest) > 0.5 * (1.0 - OF_TRIANGLES) * least
+        missing = self.bodies.sag(self._longest) - 0.5 * (1.0 - OF_TRIANGLES) * least
+        shows = missing > LARGEST_LIFT * least
+        lift = np.where(shows, 0.0, np.maximum(missing, 0.0))
+        self.bodies.set_lift(lift)
+        self._largest_half = 0.5 * largest + lift.max(initial=0.0)
         if (shows != self._shows).any():
             self._shows = shows
             self.bodies.look_at_triangles(shows)
@@ -448,7 +456,7 @@ def find_rigid_contacts(
                             b,
                             surface.position[i],
                             surface.displacement[i],
-                            half,
+                            half + bodies.lift[b],
                             surface.friction[i],
                             Four(i),
                             ti.math.vec4(1.0, 0.0, 0.0, 0.0),

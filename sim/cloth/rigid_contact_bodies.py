@@ -29,6 +29,7 @@ class CollisionBodies(DeviceShapes):
         shows: whether it may show between vertices, so that triangles are looked at; 2 if edges are, too, (b,).
         depth: how deep free cloth was in each at most since `begin_frame`, in its thicknesses, (b,).
         friction: [-], (b,).
+        lift: how much farther than half a thickness vertices keep [m], (b,).
         position: centre of mass at the start of the substep [m], (b,) vec3.
         rotation: body axes to world axes, (b,) mat3.
         motion: displacement of the centre of mass in the substep [m] and rotation vector [rad] of each body in turn,
@@ -50,7 +51,8 @@ class CollisionBodies(DeviceShapes):
         room = max(self.count, 1)
         self.shows = ti.ndarray(ti.i32, room)
         self.shows.fill(0)
-        self.friction, self.inverse_mass, self.depth = (ti.ndarray(ti.f32, room) for _ in range(3))
+        self.friction, self.inverse_mass, self.depth, self.lift = (ti.ndarray(ti.f32, room) for _ in range(4))
+        self.lift.fill(0.0)
         self.begin_frame()
         self.position = ti.Vector.ndarray(3, ti.f32, room)
         self.motion, self.motion_start, self.motion_reached = (ti.Vector.ndarray(3, ti.f32, 2 * room) for _ in range(3))
@@ -76,6 +78,7 @@ class CollisionBodies(DeviceShapes):
             radius=self.radius,
             step=self.step,
             friction=self.friction,
+            lift=self.lift,
             position=self.position,
             rotation=self.rotation,
             motion=self.motion,
@@ -106,6 +109,11 @@ class CollisionBodies(DeviceShapes):
         """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""
         if self.count:
             put(self.friction, friction)
+
+    def set_lift(self, lift: Array) -> None:
+        """Say how much farther than half a thickness vertices keep from each [m], (b,)."""
+        if self.count:
+            put(self.lift, lift)
 
     def place(self, poses: Poses, inverse_mass: Array, inverse_inertia: Array) -> None:
         """Say where the bodies are, and how easily they move.

@@ -1,0 +1,56 @@
+"""What one contact lacks, and the impulse by which it answers, within Coulomb's cone."""
+
+import taichi as ti
+
+from sim.cloth.bundles import Contacts, Impulses
+from sim.core.arrays import Floats, LongIntegers, Vectors
+from sim.core.bundles import func
+
+
+@func
+def relative_displacement(c: ti.i32, contacts: Contacts, displacement: Vectors, body_motion: Vectors) -> ti.math.vec3:
+    """Of the first side of a contact against the second, or against the body [m]."""
+    w = ti.math.vec3(0.0)
+    for k in ti.static(range(4)):
+        if contacts.weights[c][k] != 0.0:
+            w += contacts.weights[c][k] * displacement[contacts.vertices[c][k]]
+    b = contacts.kind[c]
+    if b >= 0:
+        w -= body_motion[2 * b] + body_motion[2 * b + 1].cross(contacts.arm[c])
+    return w
+
+
+@func
+def answered(
+    c: ti.i32, ahead: ti.math.vec3, contacts: Contacts, impulses: Impulses, displacement: Vectors, body_motion: Vectors
+) -> ti.math.vec3:
+    """The impulse of a contact that has one, by which displacements lead, after a step of the residual over D."""
+    n = contacts.normal[c]
+    w = relative_displacement(c, contacts, displacement, body_motion)
+    along = ti.max(ahead.dot(n) + (contacts.floor[c] - w.dot(n)) / impulses.mobility[c], 0.0)
+    sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / impulses.mobility[c]
+    held, length = contacts.friction[c] * along, sideways.norm()
+    if length > held:
+        sideways *= held / length
+    return along * n + sideways
+
+
+@ti.func
+def body_mobility(arm: ti.math.vec3, inverse_mass: ti.f32, inverse_inertia: ti.math.mat3) -> ti.f32:
+    """Upper bound of how much a body's point moves per impulse on it [1/kg]."""
+    return inverse_mass + arm.norm_sqr() * ti.math.mat3(inverse_inertia).norm()
+
+
+@ti.func
+def give_body(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers):
+    """Add the opposite of an impulse, in units, to what a body gets, to the nearest unit."""
+    twist = arm.cross(push)
+    for axis in ti.static(range(3)):
+        ti.atomic_add(body_gathered[6 * body + axis], -ti.round(push[axis], ti.i64))
+        ti.atomic_add(body_gathered[6 * body + 3 + axis], -ti.round(twist[axis], ti.i64))
+
+
+@ti.func
+def thickness_between(vertices: ti.types.vector(4, ti.i32), thickness: Floats) -> ti.f32:
+    """Distance that the sides of a pair keep [m]; of a contact with a body or a wall, the thickness of the cloth."""
+    return 0.5 * (thickness[vertices[0]] + thickness[vertices[3]])
