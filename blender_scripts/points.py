@@ -58,6 +58,16 @@ def new_points_object(name: str, material: Any) -> Any:
     return blender_object
 
 
+def let_light_by(blender_object: Any) -> None:
+    """Let only rays meet points that come from the camera, by mirrors or through what is clear.
+
+    Drops turn light by little: what they light and shade is lit about as without them, and rays that look for lamps
+    would meet dozens.
+    """
+    for kind in ("diffuse", "shadow", "volume_scatter"):
+        setattr(blender_object, f"visible_{kind}", False)
+
+
 def fill_points(mesh: Any, points: Points) -> None:
     """Replace the points of an object's mesh."""
     mesh.clear_geometry()

@@ -318,6 +318,8 @@ class SceneRenderer:
             )
         elif kind == "point_sequence":
             blender_object = points.new_points_object(name, material)
+            if look in LOOK_TABLE and LOOK_TABLE[look].lets_light_by:
+                points.let_light_by(blender_object)
             self._sequences.append((description, blender_object))
         else:
             blender_object = volumes.new_volume_object(name)

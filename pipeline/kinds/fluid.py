@@ -30,7 +30,7 @@ from render.surface import reconstruct_surface
 from sim.core.snapshots import Snapshot
 from sim.fluid.parameters import FluidParameters
 from sim.shapes.parameters import Placement
-from sim.whitewater.kinds import LiquidKind, drops_of_particle, mean_diameter
+from sim.whitewater.kinds import LiquidKind, mean_diameter
 
 if TYPE_CHECKING:
     import h5py
@@ -102,12 +102,11 @@ def _colored(
     absorbs = liquid.look in INSIDES and LOOK_TABLE[liquid.look].refracts
     if drops.look != "drops" or drops.color is not None or not absorbs:
         return drops
-    count = drops_of_particle(
+    diameter = mean_diameter(
         particle_radius=fluid.particle_radius,
         diameter=job.surface.drop_diameter,
-        most=max(1, job.surface.drops_per_particle),
+        most=job.surface.drops_per_particle,
     )
-    diameter = mean_diameter(particle_radius=fluid.particle_radius, count=count)
     assert liquid.look is not None and liquid.density is not None, "materials are as dense as they are drawn"
     color = through_ball(liquid.look, diameter, liquid.density, liquid.color)
     return drops.model_copy(update={"color": color})
