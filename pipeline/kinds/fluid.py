@@ -38,9 +38,11 @@ if TYPE_CHECKING:
 WETS_WITHIN_RADII = 1.5
 """How near a fluid's surface is to what it touches, in radii of its particles: up to 0.8 above moving ones."""
 
-WORKER_BYTES = 100_000_000
-BYTES_PER_SURFACE_PARTICLE = 140_000
-"""Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`."""
+WORKER_BYTES = 110_000_000
+BYTES_PER_SURFACE_PARTICLE = 220_000
+"""Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`. A block at rest
+takes 130,000; more where particles are in sheets, which get samples between them: with 28 % of 15,000 and with 7 % of
+99,000 a process had 243 and 542 MB."""
 CUBE_SIZE = 0.75
 """In radii. Cubes of half the width need four times the memory."""
 
