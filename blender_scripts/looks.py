@@ -25,11 +25,11 @@ MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
 
 
 MIST_GOES_FORWARD = 0.85
-"""Share of the light through drops too small to be seen that keeps its direction [-]: the asymmetry of scattering by
+"""Share of the light through drops that are no points that keeps its direction [-]: the asymmetry of scattering by
 balls of water in geometric optics (Bohren & Huffman 1983). Scattered evenly, the rest carries as much light aside."""
 
-RESOLVED_RADIUS = (0.25, 0.75)
-"""Radii of drops [pixels] up to which they are mist, and from which they are lenses."""
+SMALLEST_DROP = 0.75
+"""Radius of drops at least [pixels]; fewer of these stand for smaller ones."""
 
 BENT_BY_DROPS = 2
 """How many drops bend a path, each and other surfaces counted."""
@@ -174,7 +174,7 @@ def _spray(builder: NodeBuilder, context: LookContext) -> None:
 
 @draws("drops")
 def _drops(builder: NodeBuilder, context: LookContext) -> None:
-    """Drops of a clear liquid: small lenses that show what is behind them upside down, and mist where a pixel is wider.
+    """Drops of a clear liquid: small lenses that show what is behind them upside down; mist on what is no point.
 
     Points are hit on their front only, so what enters leaves there, in the direction that both refractions give it.
     That is one refraction with an index of its own for each angle. A path goes straight through drops once
@@ -190,7 +190,8 @@ def _drops(builder: NodeBuilder, context: LookContext) -> None:
     drop = builder.mix_shaders(bent, lens, through)
     scattered = _scattering(builder, or_default(context.color, (0.97, 0.985, 1.0)))
     mist = builder.mix_shaders(MIST_GOES_FORWARD, scattered, through)
-    inner = builder.mix_shaders(_resolved(builder, context), mist, drop)
+    is_point = builder.math("GREATER_THAN", builder.node("ShaderNodePointInfo").outputs["Radius"], 0.0)
+    inner = builder.mix_shaders(is_point, mist, drop)
     mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.05))
     fresnel = builder.node("ShaderNodeFresnel", IOR=index)
     builder.surface(builder.mix_shaders(fresnel.outputs[0], inner, mirror))
@@ -209,13 +210,6 @@ def _index_of_ball(builder: NodeBuilder, index: float) -> Any:
     inside = builder.math("SQRT", builder.math("SUBTRACT", 1.0, sine_inside))
     both = builder.math("MULTIPLY", builder.math("MULTIPLY", cosine, inside), 2.0 / index)
     return builder.math("DIVIDE", 1.0, builder.math("ADD", both, builder.math("MULTIPLY_ADD", sine_inside, 2.0, -1.0)))
-
-
-def _resolved(builder: NodeBuilder, context: LookContext) -> Any:
-    """The output socket of how far the camera makes out a ball: 0 where it is small in a pixel, 1 where it is not."""
-    radius = builder.node("ShaderNodePointInfo").outputs["Radius"]
-    pixel = builder.math("MULTIPLY", builder.node("ShaderNodeCameraData").outputs["View Distance"], context.pixel_angle)
-    return builder.smoothstep(builder.math("DIVIDE", radius, pixel), *RESOLVED_RADIUS)
 
 
 @draws("foam")

@@ -48,6 +48,7 @@ FIRST_PIECES = 4
 FARTHEST = 3.0
 """Of a cloud's drops from its middle, in standard deviations."""
 _THINNEST = 0.01  # of ligaments, in their mean width: a millionth is thinner
+_DIFFER = 0.04  # a ball of a particle's radius has 0.524 of its volume, so that none of two reaches it
 _ROUND_OFF = 1e-6  # of reaches in single precision: none is less than itself
 
 
@@ -162,11 +163,15 @@ def _numbers(particle_id: NDArray[np.int32], *, particle_radius: float, diameter
 
 
 def _no_marbles(share: NDArray[np.float64], owner: NDArray[np.intp], pieces: NDArray[np.intp]) -> NDArray[np.float64]:
-    """The shares that drops have of their particle with none above `LARGEST_SHARE`, and the others larger for it."""
+    """The shares that drops have of their particle with one above `LARGEST_SHARE` about that, the others the rest.
+
+    No two are equal: a radius tells drops apart.
+    """
     is_large = (share > LARGEST_SHARE) & (pieces[owner] > 1)
+    smaller = LARGEST_SHARE - _DIFFER * (1.0 - share)
     factor = np.ones(len(pieces))
-    factor[owner[is_large]] = (1.0 - LARGEST_SHARE) / (1.0 - share[is_large])
-    return np.where(is_large, LARGEST_SHARE, share * factor[owner])
+    factor[owner[is_large]] = (1.0 - smaller[is_large]) / (1.0 - share[is_large])
+    return np.where(is_large, smaller, share * factor[owner])
 
 
 def _pieces(count: NDArray[np.intp], reach_in_radii: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -14,7 +14,7 @@ LIGAMENT_ORDER = 4.0
 MEAN_SHARE = 0.5
 """Drops of a ligament of mean width, at most, as a share of what one particle may be: thinner ones have more [-]."""
 LARGEST_SHARE = 0.5
-"""Of a particle that one drop is at most, unless drops are larger [-]: spray is no ball of a particle's size."""
+"""Of a particle that one drop is about at most, unless drops are larger [-]: spray is no ball of a particle's size."""
 
 _VOLUME_OF_MEAN = math.pi / 6.0 * (GAMMA_ORDER + 1.0) * (GAMMA_ORDER + 2.0) / GAMMA_ORDER**2
 """Mean volume of drops over the cube of their mean diameter [-]."""

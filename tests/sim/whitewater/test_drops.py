@@ -158,7 +158,7 @@ def test_a_particle_breaks_bit_by_bit_and_what_breaks_are_whole_drops():
         for coarse, fine in zip(before, after, strict=True):
             assert len(coarse.radius) <= len(fine.radius) <= max(2 * len(coarse.radius), 40)
             edges = np.cumsum(volumes(fine))
-            if max(volumes(coarse).max(), volumes(fine).max()) < 0.499 * PARTICLE:  # which is the most of a drop
+            if max(volumes(coarse).max(), volumes(fine).max()) < 0.479 * PARTICLE:  # which is the most of a drop
                 whole += 1
                 assert all(np.abs(edges - edge).min() < 1e-9 * PARTICLE for edge in np.cumsum(volumes(coarse)))
     assert whole > 100
@@ -170,6 +170,7 @@ def test_no_drop_is_a_ball_of_a_particle_s_size(width):
     radii = made(state, fluid).radius
     assert radii.max() < RADIUS
     assert radii.max() > 0.9 * RADIUS
+    assert len(np.unique(radii.astype(np.float32))) > 0.99 * len(radii), "a radius is what tells drops apart"
     large = made(state, fluid, diameter=2.5 * RADIUS)  # where drops are larger than particles each is one
     assert np.mean(large.radius > RADIUS) > 0.2
 
