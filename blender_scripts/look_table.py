@@ -34,6 +34,7 @@ class LookRow:
         paints_parts: parts of a body in this look keep their own materials; other looks are of one piece.
         fits_sheets: whether its texture is scaled by the size of a cloth.
         paves: whether the ground of a set can have it.
+        lets_light_by: whether points of it are there for the eye alone, and lamps shine past them.
         revision: raised when the same keys give other pixels.
     """
 
@@ -43,6 +44,7 @@ class LookRow:
     paints_parts: bool = False
     fits_sheets: bool = False
     paves: bool = False
+    lets_light_by: bool = False
     revision: int = 1
 
     @property
@@ -75,7 +77,7 @@ LOOK_TABLE: dict[str, LookRow] = {
     "stone": LookRow(SURFACES, ("roughness",), swims_on=("fluid", "cloth"), fits_sheets=True, paves=True, revision=2),
     "wood": LookRow(SURFACES, ("roughness",), swims_on=("fluid",), fits_sheets=True, paves=True, revision=2),
     "glass": LookRow(SURFACES, ("roughness", "caustics"), revision=2),
-    "drops": LookRow(SURFACES, ("roughness",), revision=2),
+    "drops": LookRow(SURFACES, ("roughness",), lets_light_by=True, revision=3),
     "spray": LookRow(SURFACES, ("roughness",)),
     "foam": LookRow(SURFACES),
     "bubbles": LookRow(SURFACES, ("roughness",)),

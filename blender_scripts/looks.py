@@ -24,8 +24,15 @@ MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
 """Diffuse reflectance of whole milk for red, green and blue light [-] (Jensen et al. 2001, fig. 5)."""
 
 
-DROPS_GO_FORWARD = 0.85
-"""Share of the light through a drop that keeps its direction [-]."""
+MIST_GOES_FORWARD = 0.85
+"""Share of the light through drops that are no points that keeps its direction [-]: the asymmetry of scattering by
+balls of water in geometric optics (Bohren & Huffman 1983). Scattered evenly, the rest carries as much light aside."""
+
+SMALLEST_DROP = 0.75
+"""Radius of drops at least [pixels]; fewer of these stand for smaller ones."""
+
+BENT_BY_DROPS = 2
+"""How many drops bend a path, each and other surfaces counted."""
 
 
 def new_material(name: str, look: str, context: LookContext) -> Any:
@@ -167,18 +174,42 @@ def _spray(builder: NodeBuilder, context: LookContext) -> None:
 
 @draws("drops")
 def _drops(builder: NodeBuilder, context: LookContext) -> None:
-    """Drops of a clear liquid that a picture does not resolve: mirrors by Fresnel's law, and what enters goes forward.
+    """Drops of a clear liquid: small lenses that show what is behind them upside down; mist on what is no point.
 
-    A ball of water turns light by so little that all but 15 % of it goes on as if it were not there (asymmetry 0.85 in
-    geometric optics, Bohren & Huffman 1983); that share is scattered. Points are hit on their front only. A colour is
-    that of the liquid through a drop, whichever way light leaves it.
+    Points are hit on their front only, so what enters leaves there, in the direction that both refractions give it.
+    That is one refraction with an index of its own for each angle. A path goes straight through drops once
+    `BENT_BY_DROPS` of them, or as many other surfaces, have bent it: in dense spray it would end in one, black. A
+    colour is that of the liquid through a drop, whichever way light leaves it.
     """
+    color = or_default(context.color, (1.0, 1.0, 1.0))
+    index = REFRACTIVE_INDEX["water"]
+    lens = builder.node("ShaderNodeBsdfRefraction", Color=color, Roughness=0.0, IOR=_index_of_ball(builder, index))
+    through = builder.node("ShaderNodeBsdfTransparent", Color=color)
+    path = builder.node("ShaderNodeLightPath").outputs
+    bent = builder.math("GREATER_THAN", path["Transmission Depth"], BENT_BY_DROPS - 0.5)
+    drop = builder.mix_shaders(bent, lens, through)
     scattered = _scattering(builder, or_default(context.color, (0.97, 0.985, 1.0)))
-    through = builder.node("ShaderNodeBsdfTransparent", Color=or_default(context.color, (1.0, 1.0, 1.0)))
-    inner = builder.mix_shaders(DROPS_GO_FORWARD, scattered, through)
+    mist = builder.mix_shaders(MIST_GOES_FORWARD, scattered, through)
+    is_point = builder.math("GREATER_THAN", builder.node("ShaderNodePointInfo").outputs["Radius"], 0.0)
+    inner = builder.mix_shaders(is_point, mist, drop)
     mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.05))
-    fresnel = builder.node("ShaderNodeFresnel", IOR=REFRACTIVE_INDEX["water"])
+    fresnel = builder.node("ShaderNodeFresnel", IOR=index)
     builder.surface(builder.mix_shaders(fresnel.outputs[0], inner, mirror))
+
+
+def _index_of_ball(builder: NodeBuilder, index: float) -> Any:
+    """The output socket of the index whose one refraction turns light as far as a ball of an index does with two.
+
+    Light at an angle a to the normal is at b inside, sin b = sin a / index, and leaves at 2 (a - b) from its way. The
+    reciprocal of what is looked for is sin(2 b - a) / sin a = 2 cos a cos b / index + 2 sin² b - 1.
+    """
+    geometry = builder.node("ShaderNodeNewGeometry").outputs
+    cosine = builder.vector_math("DOT_PRODUCT", geometry["Incoming"], geometry["Normal"])
+    square = builder.math("MULTIPLY", cosine, cosine)
+    sine_inside = builder.math("DIVIDE", builder.math("SUBTRACT", 1.0, square), index**2)  # squared
+    inside = builder.math("SQRT", builder.math("SUBTRACT", 1.0, sine_inside))
+    both = builder.math("MULTIPLY", builder.math("MULTIPLY", cosine, inside), 2.0 / index)
+    return builder.math("DIVIDE", 1.0, builder.math("ADD", both, builder.math("MULTIPLY_ADD", sine_inside, 2.0, -1.0)))
 
 
 @draws("foam")

@@ -46,16 +46,26 @@ def read_points(path: Path, kind: str) -> Points:
     )
 
 
-def new_points_object(name: str, material: Any) -> Any:
+def new_points_object(name: str, material: Any, smallest_angle: float | None = None) -> Any:
     """An object without points yet, linked into the scene.
 
     Its vertices become spheres in a geometry-nodes modifier: `radius` is their size, and `velocity` [m/s], which the
-    modifier passes on, blurs them.
+    modifier passes on, blurs them. Fewer and larger ones stand for what the camera sees at a smaller angle [rad].
     """
     blender_object = new_object(name, bpy.data.meshes.new(name))
     modifier = blender_object.modifiers.new("spheres", "NODES")
-    modifier.node_group = _spheres(name, material)
+    modifier.node_group = _spheres(name, material, smallest_angle)
     return blender_object
+
+
+def let_light_by(blender_object: Any) -> None:
+    """Let only rays meet points that come from the camera, by mirrors or through what is clear.
+
+    Drops turn light by little: what they light and shade is lit about as without them, and rays that look for lamps
+    would meet dozens.
+    """
+    for kind in ("diffuse", "shadow", "volume_scatter"):
+        setattr(blender_object, f"visible_{kind}", False)
 
 
 def fill_points(mesh: Any, points: Points) -> None:
@@ -70,21 +80,63 @@ def fill_points(mesh: Any, points: Points) -> None:
     mesh.update()
 
 
-def _spheres(name: str, material: Any) -> Any:
+def _spheres(name: str, material: Any, smallest_angle: float | None) -> Any:
     """Geometry nodes that turn vertices into spheres of their radius and material."""
     group = bpy.data.node_groups.new(f"{name} spheres", "GeometryNodeTree")
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     nodes, links = group.nodes, group.links
     vertices, spheres = nodes.new("NodeGroupInput"), nodes.new("NodeGroupOutput")
-    radius = nodes.new("GeometryNodeInputNamedAttribute")
-    radius.data_type = "FLOAT"
-    radius.inputs["Name"].default_value = "radius"
+    named = nodes.new("GeometryNodeInputNamedAttribute")
+    named.data_type = "FLOAT"
+    named.inputs["Name"].default_value = "radius"
+    radius = named.outputs["Attribute"]
     to_points = nodes.new("GeometryNodeMeshToPoints")
+    if smallest_angle is not None:
+        radius, is_drawn = _seen(group, radius, smallest_angle)
+        links.new(is_drawn, to_points.inputs["Selection"])
     painted = nodes.new("GeometryNodeSetMaterial")
     painted.inputs["Material"].default_value = material
     links.new(vertices.outputs[0], to_points.inputs["Mesh"])
-    links.new(radius.outputs["Attribute"], to_points.inputs["Radius"])
+    links.new(radius, to_points.inputs["Radius"])
     links.new(to_points.outputs[0], painted.inputs["Geometry"])
     links.new(painted.outputs[0], spheres.inputs[0])
     return group
+
+
+def _seen(group: Any, radius: Any, smallest_angle: float) -> tuple[Any, Any]:
+    """The output sockets of the radii that spheres are drawn in, and of which of them are.
+
+    Those that the camera sees at a smaller angle [rad] are drawn at it, and as many fewer as they cover more: the light
+    that they let pass stays the same. A sphere's lot goes by its radius, so that it has the same one in every frame.
+    """
+    nodes = group.nodes
+
+    def node(kind: str, *values: Any, **properties: Any) -> Any:
+        made = nodes.new(kind)
+        for key, value in properties.items():
+            setattr(made, key, value)
+        sockets = [socket for socket in made.inputs if socket.enabled]
+        for socket, value in zip(sockets, values, strict=False):
+            if isinstance(value, bpy.types.NodeSocket):
+                group.links.new(value, socket)
+            else:
+                socket.default_value = value
+        return next(socket for socket in made.outputs if socket.enabled)
+
+    def math(operation: str, *values: Any) -> Any:
+        return node("ShaderNodeMath", *values, operation=operation)
+
+    camera = nodes.new("GeometryNodeObjectInfo")
+    group.links.new(node("GeometryNodeInputActiveCamera"), camera.inputs["Object"])
+    away = nodes.new("ShaderNodeVectorMath")
+    away.operation = "DISTANCE"
+    group.links.new(node("GeometryNodeInputPosition"), away.inputs[0])
+    group.links.new(camera.outputs["Location"], away.inputs[1])
+    drawn = math("MAXIMUM", radius, math("MULTIPLY", away.outputs["Value"], smallest_angle))
+    share = math("POWER", math("DIVIDE", radius, drawn), 2.0)
+    lot = nodes.new("FunctionNodeRandomValue")
+    lot.data_type = "FLOAT"
+    group.links.new(node("FunctionNodeHashValue", radius, data_type="FLOAT"), lot.inputs["ID"])
+    value = next(socket for socket in lot.outputs if socket.enabled)
+    return drawn, node("FunctionNodeCompare", value, share, data_type="FLOAT", operation="LESS_THAN")

@@ -317,7 +317,11 @@ class SceneRenderer:
                 (description, blender_object)
             )
         elif kind == "point_sequence":
-            blender_object = points.new_points_object(name, material)
+            is_for_the_eye = look in LOOK_TABLE and LOOK_TABLE[look].lets_light_by
+            smallest = looks.SMALLEST_DROP * context.pixel_angle if is_for_the_eye else None
+            blender_object = points.new_points_object(name, material, smallest)
+            if is_for_the_eye:
+                points.let_light_by(blender_object)
             self._sequences.append((description, blender_object))
         else:
             blender_object = volumes.new_volume_object(name)

@@ -44,11 +44,12 @@ class SurfaceParameters(Parameters):
         description="Mean diameter of the drops that spray breaks up into [m]; the capillary length of water.",
     )
     drops_per_particle: int = Field(
-        default=40,
+        default=16,
         ge=0,
         le=1000,
-        description="Most drops that a particle of spray is drawn as; they are larger than `drop_diameter` where it "
-        "would take more. 0: nothing breaks up, and lone particles are drawn as balls. [-]",
+        description="Most drops that a particle of spray is drawn as, and twice what a usual one is; they are larger "
+        "than `drop_diameter` where it would take more. 0: nothing breaks up, and lone particles are drawn as balls. "
+        "[-]",
     )
 
 

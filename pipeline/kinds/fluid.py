@@ -30,7 +30,7 @@ from render.surface import reconstruct_surface
 from sim.core.snapshots import Snapshot
 from sim.fluid.parameters import FluidParameters
 from sim.shapes.parameters import Placement
-from sim.whitewater.kinds import LiquidKind, drops_of_particle, mean_diameter
+from sim.whitewater.kinds import LiquidKind, mean_diameter
 
 if TYPE_CHECKING:
     import h5py
@@ -38,9 +38,11 @@ if TYPE_CHECKING:
 WETS_WITHIN_RADII = 1.5
 """How near a fluid's surface is to what it touches, in radii of its particles: up to 0.8 above moving ones."""
 
-WORKER_BYTES = 100_000_000
-BYTES_PER_SURFACE_PARTICLE = 140_000
-"""Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`."""
+WORKER_BYTES = 110_000_000
+BYTES_PER_SURFACE_PARTICLE = 220_000
+"""Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`. A block at rest
+takes 130,000; more where particles are in sheets, which get samples between them: with 28 % of 15,000 and with 7 % of
+99,000 a process had 243 and 542 MB."""
 CUBE_SIZE = 0.75
 """In radii. Cubes of half the width need four times the memory."""
 
@@ -102,12 +104,11 @@ def _colored(
     absorbs = liquid.look in INSIDES and LOOK_TABLE[liquid.look].refracts
     if drops.look != "drops" or drops.color is not None or not absorbs:
         return drops
-    count = drops_of_particle(
+    diameter = mean_diameter(
         particle_radius=fluid.particle_radius,
         diameter=job.surface.drop_diameter,
-        most=max(1, job.surface.drops_per_particle),
+        most=job.surface.drops_per_particle,
     )
-    diameter = mean_diameter(particle_radius=fluid.particle_radius, count=count)
     assert liquid.look is not None and liquid.density is not None, "materials are as dense as they are drawn"
     color = through_ball(liquid.look, diameter, liquid.density, liquid.color)
     return drops.model_copy(update={"color": color})

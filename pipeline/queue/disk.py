@@ -43,7 +43,7 @@ class Size(NamedTuple):
     pixels: int  # of a picture
     picture_bytes_per_pixel: float = 1.2  # what a picture takes, on the mean of its files [bytes]
     film_factor: float = 1.0  # how much more a film takes than one of H.264 [-]
-    drops_per_particle: float = 0.0  # of spray, at most [-]
+    drops_per_particle: float = 0.0  # of spray, on average [-]
 
 
 def size_of(job: Job, findings: Findings) -> Size:
@@ -59,7 +59,7 @@ def size_of(job: Job, findings: Findings) -> Size:
 
 
 def _drops_per_particle(job: Job) -> float:
-    """Of the largest particles."""
+    """Of the largest particles, once they have broken up."""
     largest = max((fluid.particle_radius for fluid in job.fluid), default=0.0)
     diameter, most = job.surface.drop_diameter, job.surface.drops_per_particle
     return drops_of_particle(particle_radius=largest, diameter=diameter, most=most)

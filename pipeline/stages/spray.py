@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from math import ceil
 from typing import TYPE_CHECKING
@@ -26,10 +26,12 @@ from sim.core.runtime import initialize
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
 from sim.fluid.parameters import FluidParameters
-from sim.whitewater.kinds import LiquidKind, drops_of_particle
+from sim.whitewater.kinds import LiquidKind
 
 if TYPE_CHECKING:
-    from sim.whitewater.drops import Drops
+    from numpy.typing import NDArray
+
+    from sim.whitewater.drops import Drops, Reach
     from sim.whitewater.liquid import LiquidState
     from sim.whitewater.obstacles import Obstacles
 
@@ -54,7 +56,7 @@ class SprayStage(Stage):
 
     name = "spray"
     about = "drops of fluids"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame of each fluid."""
@@ -92,10 +94,11 @@ class SprayStage(Stage):
         bodies = read_fluids_and_bodies(layout.path(task.inputs[0]))
         solids = _solids(job, bodies, bodies[task.subject].number("particle_radius"))
         state = _kinds(context, bodies, solids)
-        drops, gone = _drops(job, bodies, task.subject, state, solids)
+        reach = _reach(job, bodies[task.subject], state)
+        drops, gone = _drops(job, bodies, task.subject, state, reach=reach, solids=solids)
         kinds = Snapshot(
             "fluid",
-            {"particle_id": state.particle_id, "liquid": state.kind, "held": state.held, "reach": state.reach},
+            {"particle_id": state.particle_id, "liquid": state.kind, "held": state.held, "reach": reach.width},
             {"volume_of_drops": drops.volume + gone},
         )
         with ExitStack() as stack:
@@ -140,7 +143,7 @@ def _solids(job: Job, bodies: Mapping[str, Snapshot], particle_radius: float) ->
 
 def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot], solids: Obstacles) -> LiquidState:
     """The kinds of the task's fluid, from those of the frame before."""
-    from sim.whitewater.drops import atomizes, spread
+    from sim.whitewater.drops import atomizes
     from sim.whitewater.liquid import LiquidState, lie_on, next_liquid
     from sim.whitewater.motion import FluidState
 
@@ -155,7 +158,7 @@ def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot], solids: Obstacl
     breaks_up = job.surface.drops_per_particle > 0 and atomizes(
         viscosity=said.viscosity, rest_density=said.rest_density, particle_radius=particle_radius
     )
-    state = next_liquid(
+    return next_liquid(
         before,
         FluidState.of_snapshots([bodies[each.name] for each in job.fluid]),
         fluid.particle_id,
@@ -164,30 +167,61 @@ def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot], solids: Obstacl
         atomizes=breaks_up,
         lies=lie_on(solids, fluid, particle_radius=particle_radius, frame_dt=1.0 / job.fps),
     )
-    return spread(state, fluid, particle_radius=particle_radius, dt=1.0 / job.fps)
+
+
+def _reach(job: Job, body: Snapshot, state: LiquidState) -> Reach:
+    """How far the drops of a fluid's spray are spread, from how far they were."""
+    from sim.whitewater.drops import grown_reach
+    from sim.whitewater.motion import FluidState
+
+    fluid = FluidState.of_snapshots([body])
+    return grown_reach(state, fluid, particle_radius=body.number("particle_radius"), dt=1.0 / job.fps)
 
 
 def _drops(
-    job: Job, bodies: Mapping[str, Snapshot], name: str, state: LiquidState, solids: Obstacles
+    job: Job, bodies: Mapping[str, Snapshot], name: str, state: LiquidState, *, reach: Reach, solids: Obstacles
 ) -> tuple[Drops, float]:
-    """The drops of a fluid's spray that are neither in the liquid nor in walls and bodies; what has left [m³]."""
+    """The drops of a fluid's spray that are neither in liquid nor in walls and bodies; what has left [m³]."""
     from sim.whitewater.drops import Drops, drops_of, in_the_air
     from sim.whitewater.motion import FluidState
 
     fluid, particle_radius = FluidState.of_snapshots([bodies[name]]), bodies[name].number("particle_radius")
-    count = drops_of_particle(
-        particle_radius=particle_radius, diameter=job.surface.drop_diameter, most=job.surface.drops_per_particle
+    drops = drops_of(
+        state,
+        fluid,
+        reach,
+        particle_radius=particle_radius,
+        diameter=job.surface.drop_diameter,
+        most=job.surface.drops_per_particle,
     )
-    drops = drops_of(state, fluid, particle_radius=particle_radius, count=count)
     if not len(drops.radius):
         return drops, 0.0
-    position, velocity, _, stays = solids.collide(drops.position, drops.velocity, 1.0)
+    # Half of a cloud at a wall would else be spread on it.
+    position, velocity = solids.mirrored(drops.position, drops.velocity)
+    position, velocity, _, stays = solids.collide(position, velocity, 1.0)
     drops = Drops(position, velocity, drops.radius)
     has_left = ((position < job.domain.min) | (position > job.domain.max)).any(axis=1) & ~stays
-    in_air = in_the_air(
-        drops.kept(stays), fluid.position[state.kind != LiquidKind.SPRAY], particle_radius=particle_radius
-    )
+    in_air = drops.kept(stays)
+    for liquid in (fluid.position[state.kind != LiquidKind.SPRAY], *_other_liquid(job, bodies, name, particle_radius)):
+        in_air = in_the_air(in_air, liquid, particle_radius=particle_radius)
     return in_air, drops.kept(has_left).volume
+
+
+def _other_liquid(
+    job: Job, bodies: Mapping[str, Snapshot], name: str, particle_radius: float
+) -> Iterator[NDArray[np.float32]]:
+    """Particles of each other fluid of the tank [m], (n, 3), but those that are spray by this frame alone."""
+    from sim.whitewater.liquid import hangs_together
+    from sim.whitewater.motion import FluidState
+
+    others = [each.name for each in job.fluid if each.name != name]
+    if not others:
+        return
+    tank = FluidState.of_snapshots([bodies[each.name] for each in job.fluid])
+    whole = tank.particle_id[hangs_together(tank, particle_radius=particle_radius)]
+    for other in others:
+        fluid = FluidState.of_snapshots([bodies[other]])
+        yield fluid.position[np.isin(fluid.particle_id, whole)]
 
 
 def _points(drops: Drops) -> PointCloud:

@@ -85,7 +85,7 @@ def next_liquid(
 ) -> LiquidState:
     """The kinds of a fluid's particles at a frame; `sim.core.runtime.initialize` must have run.
 
-    `reach` is as before, and 0 for what has just become spray: `drops.spread` lets it grow.
+    `reach` is as before, and 0 for what has just become spray: `drops.grown_reach` lets it grow.
 
     Args:
         before: the same fluid one frame before; empty at the first.
@@ -120,6 +120,13 @@ def next_liquid(
     held = np.where(is_new, 255, np.where(changes, 1, np.minimum(held, 254) + 1)).astype(np.uint8)
     reach = np.where((kind == LiquidKind.SPRAY) & ~changes, reach, np.float32(0.0)).astype(np.float32)
     return LiquidState(particle_id, kind, held, reach)
+
+
+def hangs_together(tank: FluidState, *, particle_radius: float) -> NDArray[np.bool_]:
+    """Which particles of a tank, of one radius [m], are no spray by this frame alone, (n,)."""
+    neighbors, _, piece = _surroundings(tank, 2.0 * particle_radius)
+    whole: NDArray[np.bool_] = (piece >= SPRAY_PIECE) & (neighbors > LONELY)
+    return whole
 
 
 def _surroundings(tank: FluidState, spacing: float) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:

@@ -114,6 +114,13 @@ class Obstacles:
             inside[rows] = False
         return position, velocity, touched, inside
 
+    def mirrored(self, position: Float64Array, velocity: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Points beyond closed faces, and how they move, as their mirror images in these; (n, 3) [m] and [m/s]."""
+        below, above = position < self._wall_low, position > self._wall_high
+        position = np.where(below, 2.0 * self._wall_low - position, position)
+        position = np.where(above, 2.0 * self._wall_high - position, position)
+        return position, np.where(below | above, -velocity, velocity)
+
     def free_share(self, position: Float64Array, radius: float, share: float) -> Float64Array:
         """Share of the ball about each point that is in front of walls and bodies, taken as flat [-], (n,).
 

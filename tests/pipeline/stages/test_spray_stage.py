@@ -76,8 +76,8 @@ def test_drops_of_a_clear_liquid_have_the_colour_of_light_through_one_of_them():
     wine = drawn("water", water={"look": "wine", "density": 1.0})
     red, green, blue = drawn("water.drops", water={"look": "wine", "density": 1.0}).color
     spec, fluid = job(), job().fluid[0]
-    # As many drops as a particle may have, <d³> = 1.875 <d>³ of each.
-    diameter = 2.0 * fluid.particle_radius * (6.0 / np.pi / 1.875 / spec.surface.drops_per_particle) ** (1.0 / 3.0)
+    # Half as many drops as a particle may have, <d³> = 1.875 <d>³ of each.
+    diameter = 2.0 * fluid.particle_radius * (12.0 / np.pi / 1.875 / spec.surface.drops_per_particle) ** (1.0 / 3.0)
     assert diameter > spec.surface.drop_diameter
     mean_chord = 2.0 / 3.0 * diameter
     thin = np.exp(-mean_chord * np.array(per_metre("wine", wine.density)))
@@ -241,3 +241,31 @@ def test_a_piece_that_another_fluid_surrounds_is_no_spray(is_alone, tmp_path):
     assert run_in_a_process(layout, ["spray/oil/000000"]).count("Finished") == 1
     kinds = read_frame(layout.path(layout.liquid("oil", 0)), "oil").bodies["oil"].arrays["liquid"]
     assert (kinds == LiquidKind.SPRAY).tolist() == [is_alone] * 8
+
+
+@pytest.mark.parametrize("is_near", [True, False])
+def test_drops_within_another_fluid_are_of_the_surface(is_near, tmp_path):
+    """Lone particles of oil that fly beside a jet of water, close by or far from it."""
+    layout = JobLayout(tmp_path / "tank")
+    write_cache(layout, second_jet="oil")
+    layout.job_file.write_text(JOB_FILE.replace("[whitewater", OIL + "[whitewater"))
+    for frame in range(FRAMES):
+        path = layout.path(layout.frame_cache(frame))
+        bodies = read_frame(path).bodies
+        water = bodies["water"].arrays["position"]
+        oil = {key: array[:5].copy() for key, array in bodies["oil"].arrays.items()}
+        # Farther from each other and from the jet than what hangs together.
+        beside = [np.median(water[:, 0]), np.median(water[:, 1]), water[:, 2].max() + 0.032 + 0.3 * (not is_near)]
+        oil["position"] = np.float32(beside) + np.float32([0.04, 0.0, 0.0]) * (
+            np.arange(5, dtype=np.float32)[:, None] - 2
+        )
+        oil["velocity"] = bodies["water"].arrays["velocity"][:5].copy()
+        bodies["oil"] = Snapshot("fluid", oil, bodies["oil"].attributes)
+        write_frame(path, bodies, FrameReport(frame, frame / 60, {}, {}, {}), device="cpu")
+    assert run_in_a_process(layout, names_of("spray", range(FRAMES), "oil")).count("Finished") == FRAMES
+    kinds = read_frame(layout.path(layout.liquid("oil", 7)), "oil").bodies["oil"].arrays["liquid"]
+    assert (kinds == LiquidKind.SPRAY).all()
+    cloud = read_point_cloud(layout.path(layout.drops("oil", 7)))
+    drops = 4.0 / 3.0 * np.pi * (cloud.radius.astype(np.float64) ** 3).sum() / (5 * (2.0 * RADIUS) ** 3)
+    assert np.linalg.norm(cloud.position[:, None] - water[None], axis=2).min() > RADIUS
+    assert (0.2 < drops < 0.95) if is_near else drops == pytest.approx(1.0, rel=1e-5)

@@ -297,7 +297,7 @@ def test_surfaces_claim_what_meshing_a_splash_was_measured_to_take():
 
     cube = {"shape": {"type": "sphere", "radius": 0.3}, "position": (0, 0, 0.5)}
     full = claim(block=[cube])  # no more is known of it than that half a million fill the domain of 1 m³
-    assert 798e6 < full < 1200e6
+    assert 1146e6 < full < 1500e6  # the wildest frame of a dam break took 166 kB times n^(2/3) beside 100 MB
     assert claim({"cube_size_in_radii": 0.375}, block=[cube]) > 3 * full
     spout = {"shape": {"type": "disc", "radius": 0.02}, "position": (0, 0, 0.9), "direction": (0, 0, -1), "speed": 1.0}
     assert 100e6 < claim(block=[], emitter=[spout]) < 200e6  # it ends with the film

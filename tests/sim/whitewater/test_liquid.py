@@ -10,7 +10,7 @@ import pytest
 
 from sim.core.domain import DomainParameters
 from sim.whitewater.kinds import LiquidKind
-from sim.whitewater.liquid import CROWDED, KEPT_FRAMES, LiquidState, lie_on, next_liquid
+from sim.whitewater.liquid import CROWDED, KEPT_FRAMES, LiquidState, hangs_together, lie_on, next_liquid
 from sim.whitewater.motion import FluidState
 from sim.whitewater.obstacles import Obstacles
 
@@ -72,6 +72,14 @@ def test_small_pieces_are_spray_and_large_ones_are_not():
     assert [bool(each.all()) for each in of_piece] == [True, True, False, False]
     assert not of_piece[2].any()
     assert of_piece[3].sum() == 2, "the ends of the thread fray"
+
+
+def test_what_hangs_together_by_itself_is_what_is_no_spray_in_the_first_frame():
+    pieces = [lattice(1, 1, 1), 1.0 + lattice(2, 2, 2), 2.0 + lattice(5, 5, 5), 3.0 + 1.1 * lattice(30, 1, 1)]
+    tank = fluid(np.concatenate(pieces))
+    whole = hangs_together(tank, particle_radius=RADIUS)
+    np.testing.assert_array_equal(whole, kinds(tank).kind != LiquidKind.SPRAY)
+    assert 100 < whole.sum() < len(whole)
 
 
 def test_nothing_of_a_stiff_liquid_is_spray():

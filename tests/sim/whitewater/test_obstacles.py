@@ -96,6 +96,20 @@ def test_closed_walls_hold_and_open_ones_let_go(taichi_cpu):
     assert np.abs(after.velocity).max() == 0.0
 
 
+def test_what_is_beyond_a_closed_face_is_mirrored_in_it(taichi_cpu):
+    low, high = np.array(BOX.min), np.array(BOX.max)
+    open_top = Obstacles(DomainParameters(min=BOX.min, max=BOX.max, open_faces=("z+",)), [], DT)
+    middle = 0.5 * (low + high)
+    points = np.stack([middle, middle, middle, middle])
+    points[1, 0], points[2, 1], points[3, 2] = low[0] - 0.02, high[1] + 0.03, high[2] + 0.01
+    velocity = np.tile([1.0, 2.0, 3.0], (4, 1))
+    position, moving = open_top.mirrored(points, velocity)
+    expected = points.copy()
+    expected[1, 0], expected[2, 1] = low[0] + 0.02, high[1] - 0.03
+    np.testing.assert_allclose(position, expected, atol=1e-6)
+    np.testing.assert_array_equal(moving, [[1, 2, 3], [-1, 2, 3], [1, -2, 3], [1, 2, 3]])
+
+
 def test_what_is_caught_between_a_body_and_the_floor_is_gone():
     block = standing(placed({"type": "box", "size": [0.4, 0.4, 0.4]}), pose((0.0, 0.0, 0.15)))
     position = np.array([[0.0, 0.0, 0.001], [0.0, 0.0, 0.5]])
