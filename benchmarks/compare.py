@@ -10,8 +10,6 @@ what it prints beyond that, or less, is left out. Jobs run by its command line, 
 the record that it leaves.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json

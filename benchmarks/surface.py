@@ -10,8 +10,6 @@ Whitewater: a stirred pool and a cloud in and above it, advanced by one frame fr
 median time, and the peak memory of the process.
 """
 
-from __future__ import annotations
-
 import argparse
 import resource
 import statistics

@@ -1,7 +1,5 @@
 """The projection alone: what divergence one leaves, in how many iterations, and how exact its field is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """`pipeline sweep`: a job for each value, what they share made once, killed and continued, a sheet and a table."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import os
