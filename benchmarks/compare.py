@@ -1,29 +1,22 @@
-"""What benchmarks share - JSON, medians, two checkouts in turns -, and a table of two checkouts.
+"""What benchmarks share: JSON, medians, and two checkouts in turns.
 
-    python -m benchmarks.compare DIR [--turns 5] [--only fluid start-up ...] [--json FILE]
     python -m benchmarks.fluid --particles 20000 --against DIR [--turns 5]
 
-Both run the same commands here and in another checkout, in turns, so that whatever else the machine does slows both
+This runs the same command here and in another checkout, in turns, so that whatever else the machine does slows both
 alike. Printed are the medians here and there, and the median of the ratios within a turn: over 1 is slower here. The
-other checkout may be an old one: of it only commands are run. Its own `benchmarks.fluid` prints what this one prints;
-what it prints beyond that, or less, is left out. Jobs run by its command line, and their stages' times are read from
-the record that it leaves.
+other checkout may be an old one: its own `benchmarks.fluid` prints what this one prints; what it prints beyond that, or
+less, is left out.
 """
-
-from __future__ import annotations
 
 import argparse
 import gc
 import json
 import os
-import sqlite3
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +63,15 @@ def timed(work: Callable[[], object]) -> tuple[float, float]:
     wall, processor = time.perf_counter(), time.process_time()
     work()
     return time.perf_counter() - wall, time.process_time() - processor
+
+
+def array_bytes() -> int:
+    """What all arrays take on the device."""
+    import taichi as ti
+
+    gc.collect()
+    arrays = (found.arr for found in gc.get_objects() if isinstance(found, ti.Ndarray))
+    return sum(array.nelement() * array.element_size() for array in arrays)
 
 
 def spread(values: Sequence[float], *, scale: float = 1.0) -> dict[str, float]:
@@ -145,32 +147,6 @@ def times_in(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
         yield path, float(value)
 
 
-def pipeline(tree: Path, *arguments: str, cwd: Path) -> float:
-    """Wall time of a command of a checkout's command line [s]. Raises subprocess.CalledProcessError where it fails."""
-    command = [sys.executable, "-P", "-m", "pipeline", *arguments]
-    begin = time.perf_counter()
-    subprocess.run(command, cwd=cwd, env=environment(tree), check=True, capture_output=True)
-    return time.perf_counter() - begin
-
-
-def film(tree: Path, job: str) -> Numbers:
-    """A job as a checkout's `pipeline submit` makes it: wall time, and what its stages took by its record [s].
-
-    Of stages with several tasks a task's median counts, of others the sum.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        (root / "film.toml").write_text(job, encoding="utf-8")
-        numbers = {"film_s": pipeline(tree, "submit", "film.toml", "--executor", "inline", cwd=root)}
-        seconds: dict[str, list[float]] = {}
-        with closing(sqlite3.connect(root / "renders" / "film" / "manifest.db")) as record:
-            for stage, spent in record.execute(
-                "SELECT stage, seconds FROM attempt JOIN task ON task.id = attempt.task"
-            ):
-                seconds.setdefault(stage, []).append(spent)
-        return numbers | {f"{stage}_s": statistics.median(spent) for stage, spent in seconds.items()}
-
-
 def take_turns(measure: Callable[[Path], Numbers], other: Path, turns: int) -> list[tuple[Numbers, Numbers]]:
     """What is measured here and in another checkout, turn by turn, after one of each that warms up."""
     pairs = []
@@ -204,68 +180,3 @@ def table(measured: Mapping[str, Sequence[tuple[Numbers, Numbers]]]) -> str:
             verdict = "slower" if ratio > 1.0 + NOISE else "faster" if ratio < 1.0 - NOISE else ""
             lines.append(f"| {benchmark_name}: {name} | {here:.4g} | {there:.4g} | {ratio:.3f} | {verdict} |")
     return "\n".join(lines)
-
-
-FILM = """
-name = "film"
-frames = 12
-device = "cpu"
-[domain]
-min = [-0.3, -0.3, 0.0]
-max = [0.3, 0.3, 0.6]
-[[rigid]]
-name = "ball"
-kind = "dynamic"
-density = 300.0
-shape = { type = "sphere", radius = 0.06 }
-position = [0.05, 0.0, 0.3]
-[[fluid]]
-name = "water"
-particle_radius = 0.008
-[[fluid.block]]
-shape = { type = "box", size = [0.6, 0.6, 0.15] }
-position = [0.0, 0.0, 0.075]
-[render]
-resolution = [160, 90]
-quality = "draft"
-"""
-
-MEASURED: dict[str, Callable[[Path], Numbers]] = {
-    "start-up": lambda tree: benchmark(tree, "start_up", "--repeats", "1"),
-    "fluid": lambda tree: benchmark(tree, "fluid", "--particles", "30000", "--steps", "10", "--blocks", "5"),
-    "smoke": lambda tree: benchmark(tree, "smoke", "--cells", "64"),
-    "cloth": lambda tree: benchmark(tree, "cloth", "--nodes", "64", "--frames", "20"),
-    "scale": lambda tree: benchmark(tree, "scale", "--tasks", "10000", "--dispatched", "200"),
-    "render": lambda tree: benchmark(tree, "render", "--resolution", "240", "136"),
-    "film": lambda tree: film(tree, FILM),
-}
-"""What `python -m benchmarks.compare` runs."""
-
-
-def array_bytes() -> int:
-    """What all arrays take on the device."""
-    import taichi as ti
-
-    gc.collect()
-    arrays = (found.arr for found in gc.get_objects() if isinstance(found, ti.Ndarray))
-    return sum(array.nelement() * array.element_size() for array in arrays)
-
-
-def main() -> None:
-    parser = arguments_of(__doc__)
-    parser.add_argument("other", type=Path, metavar="DIR", help="the other checkout")
-    parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--only", nargs="+", choices=list(MEASURED), default=list(MEASURED))
-    parser.add_argument("--json", type=Path, help="also write every turn's numbers here")
-    arguments = parser.parse_args()
-    measured = {}
-    for name in arguments.only:
-        measured[name] = take_turns(MEASURED[name], arguments.other.resolve(), arguments.turns)
-        print(table({name: measured[name]}), file=sys.stderr, flush=True)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(measured, indent=1) + "\n")
-    print(table(measured))
-
-
-if __name__ == "__main__":
-    main()

@@ -6,8 +6,6 @@ Looks at each job of a folder as if it had never run, on a machine that has lear
 one has), and compares that with the attempts and files on record. Stages count as far as they came.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import replace

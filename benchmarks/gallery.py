@@ -8,8 +8,6 @@ a job may be drawn in part, with `render.order = "spread"`. The frame that is sh
 machine; those that have none either are left out, and named.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ Kernels that return something wait for the device, so that their time is that of
 with its kernel; on a GPU its time is what the host needs to hand it over, of which small scenes are made.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections import defaultdict

@@ -10,8 +10,6 @@ frame's computation, `processor_ms` the processor time of all threads a frame, p
 stands beside them.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import statistics

@@ -7,8 +7,6 @@ sheets that lie and hang, each in its own colour, dark and light, in the stage `
 and a ball of metal. Writes `look-NAME` and `stage-NAME`, and tells how many seconds and processor seconds each took.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time

@@ -8,8 +8,6 @@ volume's file and lets Blender write the picture. Prints JSON: seconds a frame a
 wall time and by CPU time; the first frame of each side warms up and is not counted. The medians of the pairs count.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import statistics

@@ -6,8 +6,6 @@
 Milliseconds; medians of the repeats, after one of each that warms the file system.
 """
 
-from __future__ import annotations
-
 import statistics
 import subprocess
 import sys

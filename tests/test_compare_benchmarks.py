@@ -1,7 +1,5 @@
 """Two checkouts are compared by what their own benchmarks print, in turns, and by what both tell."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

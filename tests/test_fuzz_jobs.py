@@ -1,7 +1,5 @@
 """Spoiled job files are refused by a sentence: a short run of `python tests/helpers/fuzz_jobs.py`."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Spoiled mesh files become a solid or a sentence: a short run of `python tests/helpers/fuzz_meshes.py`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fuzz_meshes import fuzz

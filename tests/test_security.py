@@ -1,7 +1,5 @@
 """What the code never does: run text, start shells, load pickles from files, listen to the network unasked."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -6,8 +6,6 @@ python -m validation --full                         into docs/validation: number
 python -m validation --redraw                       figures and tables from the kept numbers
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

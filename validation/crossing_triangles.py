@@ -4,8 +4,6 @@ Triangles without a common edge cross where an edge of one passes through the ot
 signs of five determinants; those that floating point cannot tell are computed with fractions.
 """
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the figures share: one colour a solver, small panels, named axes, and lines of an order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Keeps docs/validation: the numbers as JSON, the figures, and the tables of its page."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from sim.fluid.fluid import SPHFluid
     from sim.rigid.solver import RigidSolver
 
-FLUID_SOLVERS = ("wcsph", "dfsph", "pcisph")
 
 GRAVITY, WATER = 9.81, 1000.0  # [m/s²], and the density of water [kg/m³]
 

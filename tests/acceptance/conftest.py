@@ -1,7 +1,5 @@
 """The film that nobody disturbed: every other one must come out like it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

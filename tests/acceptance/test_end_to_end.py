@@ -1,7 +1,5 @@
 """From a job file to a film, and what each kind of change makes anew."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

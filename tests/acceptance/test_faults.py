@@ -1,7 +1,5 @@
 """Damaged files, places that cannot be written to, physics gone wrong: a clear line, and nothing is lost."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

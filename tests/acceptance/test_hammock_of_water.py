@@ -1,7 +1,5 @@
 """What a sample job says of itself and its tiny film is too short for: the hammock holds what is poured into it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Killed, stopped, or started twice: submitting again ends in the very same bytes, and nothing is done twice."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

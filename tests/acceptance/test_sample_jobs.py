@@ -1,7 +1,5 @@
 """Every job in jobs/ runs, small and short."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context

@@ -1,7 +1,5 @@
 """The campaign: an undisturbed run, then rounds of faults, each submitted again until the job is done."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

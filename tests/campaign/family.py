@@ -1,7 +1,5 @@
 """Every process of a campaign: what runs, what it cost, and that nothing is left over."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

@@ -1,7 +1,5 @@
 """What goes wrong: each kind of fault, how it is put in, and how it passes."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

@@ -1,7 +1,5 @@
 """When a fault strikes: after a random time, at a transition of a task, or right before a step of a process."""
 
-from __future__ import annotations
-
 import random
 import signal
 import time

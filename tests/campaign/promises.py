@@ -1,7 +1,5 @@
 """What has to hold after whatever happened."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Set
 

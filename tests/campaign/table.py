@@ -1,7 +1,5 @@
 """The campaign's result, kind by kind, as a table."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field

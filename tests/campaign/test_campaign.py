@@ -1,7 +1,5 @@
 """A short campaign, as CI runs it; a long one is made by hand, and its tables are in docs/guide/reliability.md."""
 
-from __future__ import annotations
-
 import json
 import random
 import subprocess

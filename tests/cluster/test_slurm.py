@@ -3,8 +3,6 @@
 Whatever happens, no finished task runs again, and the film is the same to the byte as one that `submit` makes.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 import signal

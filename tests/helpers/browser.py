@@ -1,7 +1,5 @@
 """A real browser for tests of pages: the Chromium that is installed, without a screen, drawing WebGL on the CPU."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterator

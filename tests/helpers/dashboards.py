@@ -1,7 +1,5 @@
 """A dashboard in a process of its own, and a browser-like client for it."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import re

@@ -1,7 +1,5 @@
 """A Dask scheduler and Dask workers in processes of their own, to be killed and started again."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

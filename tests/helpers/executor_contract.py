@@ -1,7 +1,5 @@
 """What executors promise: tests that the test class of each inherits, and what they are written with."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A small job with a body of every kind, simulated once, and its exports."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from films import JOB, Studio

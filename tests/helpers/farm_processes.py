@@ -1,7 +1,5 @@
 """A farm of synthetic jobs whose commands are real processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

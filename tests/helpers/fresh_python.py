@@ -1,7 +1,5 @@
 """Runs code in a Python of its own: one process for one Blender, one Taichi, one state of the modules."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import textwrap

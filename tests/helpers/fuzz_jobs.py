@@ -9,8 +9,6 @@ never a started job or program, nothing written, and every path of an accepted j
 Markdown table of what was refused and why; exits with 1 if a promise was broken.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random

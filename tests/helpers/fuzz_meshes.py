@@ -7,8 +7,6 @@ numbers of their headers made huge. Promised are for each: a solid or one senten
 before. Exits with 1 if a promise was broken.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import resource

@@ -1,7 +1,5 @@
 """Boxes of air with water in them, for the tests of their coupling."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A job of which some frames are simulated, none is drawn, and what it has is on receipt."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from drawn_jobs import job_of_the_ball, pose

@@ -1,7 +1,5 @@
 """Runs one task of a job in this process, as a worker would."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 

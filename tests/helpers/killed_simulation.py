@@ -3,8 +3,6 @@
 PYTHONPATH=.:tests python killed_simulation.py FOLDER write_frame|write_checkpoint FRAME
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Records of jobs with many tasks, written through the record itself; nothing of them is run."""
 
-from __future__ import annotations
-
 import time
 
 from pipeline.base.layout import JobLayout

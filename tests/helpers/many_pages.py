@@ -5,8 +5,6 @@
 Fails if the session ends, prints a traceback, stands still, or refuses a page at the end.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import json

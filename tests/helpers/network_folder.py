@@ -8,8 +8,6 @@ host's own. A server that does not answer is asked again: for ever with a SOFT_S
 with ETIMEDOUT. The server answers a repeated request without doing it again.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import pickle

@@ -1,7 +1,5 @@
 """A submitted job whose frames were written by hand, with the diagnostics that a test wants."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plans of jobs by the real stages, without any file."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a scan of ports, or a browser that looks around, sends to a page's port."""
 
-from __future__ import annotations
-
 import socket
 import ssl
 import struct

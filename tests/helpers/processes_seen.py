@@ -1,7 +1,5 @@
 """Looking at processes that may end at any moment: one that has ended answers, it does not raise."""
 
-from __future__ import annotations
-
 import psutil
 
 

@@ -1,7 +1,5 @@
 """Tasks and artifacts for the tests of the record: a small film of text files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Folders that may not be removed, also for root."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

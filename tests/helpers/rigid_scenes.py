@@ -1,7 +1,5 @@
 """Small scenes of rigid bodies that several tests share."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim.core.domain import DomainParameters

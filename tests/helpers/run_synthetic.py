@@ -1,7 +1,5 @@
 """A runner in a process of its own, to be killed: `run_synthetic.py FOLDER FRAMES`; exits with the run's code."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

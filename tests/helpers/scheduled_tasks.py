@@ -1,7 +1,5 @@
 """Tasks for the scheduler, and what its tests tell and ask it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pipeline.base.parameter_set import ParameterSet

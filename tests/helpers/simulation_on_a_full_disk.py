@@ -3,8 +3,6 @@
 PYTHONPATH=.:tests python simulation_on_a_full_disk.py FOLDER BALLAST
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

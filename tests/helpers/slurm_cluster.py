@@ -3,8 +3,6 @@
 Where slurmdbd and MariaDB are installed it has accounts too, as real sites have.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

@@ -3,8 +3,6 @@
 LEASE_EXPIRY_S says after how long a holder on another machine counts as dead [s].
 """
 
-from __future__ import annotations
-
 import os
 import sys
 

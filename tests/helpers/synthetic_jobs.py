@@ -1,7 +1,5 @@
 """Jobs over the synthetic stages, and running them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

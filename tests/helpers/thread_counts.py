@@ -1,7 +1,5 @@
 """The same computation with different numbers of threads, in two processes, as Taichi starts once a process."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

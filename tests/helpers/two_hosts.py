@@ -4,8 +4,6 @@ Each host is a set of namespaces: processes, mounts, name, network, and a boot o
 the namespace of the server. The folder has the same path everywhere; outside the hosts it is the server's own.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

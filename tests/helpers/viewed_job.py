@@ -1,7 +1,5 @@
 """A submitted job with one body of every kind, whose frames are written by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

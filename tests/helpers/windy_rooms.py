@@ -1,7 +1,5 @@
 """Boxes of air with cloth in them, for the tests of their coupling."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

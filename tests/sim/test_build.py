@@ -1,7 +1,5 @@
 """From a scene to the particles that it starts with."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree

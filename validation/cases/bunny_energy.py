@@ -1,7 +1,5 @@
 """A ball of water that falls onto a fixed bunny: how much of its mechanical energy each solver keeps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Bodies in water that nothing holds: neutral ones stay where they are, light ones float at their draught."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

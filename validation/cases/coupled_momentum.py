@@ -1,7 +1,5 @@
 """A drop hits a spinning box, without gravity or walls: together they keep their linear and angular momentum."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A column of water, twice as high as wide, that collapses: how far its front has run."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ Plane flow: v = A (-x, y), with p = 0 on the free surface, keeps an ellipse an e
 da/dt = -A a, db/dt = A b, dA/dt = A² (a² - b²)/(a² + b²), and a b = R² as well as the kinetic energy stay as they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from typing import Any

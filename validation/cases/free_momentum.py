@@ -1,7 +1,5 @@
 """A spinning, stirred drop without gravity or walls keeps its linear and angular momentum."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

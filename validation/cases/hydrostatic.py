@@ -1,7 +1,5 @@
 """A column of water at rest: its pressure is rho g (H - z) and the floor bears its weight."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

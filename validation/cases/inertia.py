@@ -1,7 +1,5 @@
 """Mass, centre of mass and inertia of a sphere, a box, and a mesh that is off its centre."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from validation.cases import Case, Found

@@ -1,7 +1,5 @@
 """The kernel integrates to one, its gradients cancel, and a filled lattice is at rest density."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

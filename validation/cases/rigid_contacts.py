@@ -1,7 +1,5 @@
 """Rigid bodies that touch: a bounce, a stack, a slope, and a collision."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

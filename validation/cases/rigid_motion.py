@@ -1,7 +1,5 @@
 """Rigid bodies that touch nothing: free fall, rotation without torque, and the flip of a tennis racket."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The projection alone: what divergence one leaves, in how many iterations, and how exact its field is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -24,12 +22,11 @@ EXACT_TOLERANCE = 3e-6  # of the latter: far below the error of the differences 
 OPEN: tuple[Face, ...] = ("x-", "x+", "y-", "y+", "z+")
 ALL_OPEN: tuple[Face, ...] = (*OPEN, "z-")
 SIDES: dict[str, tuple[Face, ...]] = {"closed box": (), "open box": OPEN}
+BOUNDS = ("walls", "open sides")  # of the exact projection
 BALL = Placement(shape=SphereShape(type="sphere", radius=0.2), position=(0.5, 0.5, 0.5))
 
 
-def find(
-    _: str, rough_cells: Sequence[int], exact_cells: Sequence[int], bodies: Sequence[bool], bounds: Sequence[str]
-) -> Found:
+def find(_: str, rough_cells: Sequence[int], exact_cells: Sequence[int], bodies: Sequence[bool]) -> Found:
     """A rough flow in open and closed boxes; refinement against an exact projection."""
     checks: list[Check] = []
     series: dict[str, Any] = {"cells": list(exact_cells)}
@@ -47,7 +44,7 @@ def find(
     checks.append(Check("most iterations of a projection", most, 5.0, 1.0, reason))
     reason = "central differences; rms, in which the half cells at open sides count little"
     spacings = [1.0 / n for n in exact_cells]
-    for name in bounds:
+    for name in BOUNDS:
         errors = [_projection_error(n, closed=name == "walls") for n in exact_cells]
         series[f"errors, {name}"] = errors
         order = fitted_order(spacings, errors)
@@ -167,7 +164,7 @@ def draw(results: Sequence[CaseResult]) -> Figure:
     spacings = [1.0 / count for count in series["cells"]]
     curves = [
         (spacings, series[f"errors, {name}"], {"color": shade, "label": name})
-        for name, shade in zip(("walls", "open sides"), SHADES, strict=False)
+        for name, shade in zip(BOUNDS, SHADES, strict=False)
     ]
     draw_refinement(order, curves, 2, "cell / box", "rms error / rms", title="exact projection")
     return figure
@@ -178,6 +175,5 @@ SIZES = {
     "rough_cells": ((32, 64), (32,)),  # across the unit box with the rough flow
     "exact_cells": ((16, 32, 64), (16, 32)),  # across the one that has an exact projection
     "bodies": ((False, True), (True,)),  # whether a ball is in the rough flow
-    "bounds": (("walls", "open sides"), ("walls",)),  # of the exact projection
 }
 CASE = Case(find, draw, solvers=("smoke",), sizes=SIZES)

@@ -1,7 +1,5 @@
 """A sphere in water at rest: what it weighs less while it is held, and how it starts when it is let go."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

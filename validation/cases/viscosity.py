@@ -6,8 +6,6 @@ viscosities, mu_a (wave along an axis) and mu_d (wave and motion along diagonals
 their mean over all directions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

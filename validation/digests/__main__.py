@@ -8,8 +8,6 @@ One line a file, `blake3  job/path`, sorted: `diff` of two versions' outputs nam
 every solver, coupling and stage. On one machine the bytes are the same in every run; processors of another make differ.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

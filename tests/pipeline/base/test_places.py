@@ -1,7 +1,5 @@
 """What stands in the place of a job's files and folders is told before any work, with what to do."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

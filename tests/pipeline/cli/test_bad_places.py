@@ -1,7 +1,5 @@
 """Disks and folders that refuse: a line instead of a traceback, and nothing that keeps the next run out."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

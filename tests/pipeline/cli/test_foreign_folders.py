@@ -1,7 +1,5 @@
 """Job folders made by somebody else: no command writes, touches or removes anything outside of them."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`verify` and `clean` on folders of the synthetic job; and what reads a damaged record."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from pathlib import Path

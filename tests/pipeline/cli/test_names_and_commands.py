@@ -1,7 +1,5 @@
 """Which command and which job is meant: former names, a file in place of a command, names and files of jobs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

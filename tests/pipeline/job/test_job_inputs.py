@@ -1,7 +1,5 @@
 """A job's folder holds the meshes that it needs."""
 
-from __future__ import annotations
-
 import os
 
 import trimesh

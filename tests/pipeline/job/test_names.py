@@ -1,7 +1,5 @@
 """Names of bodies in all scripts: what is one, and that what looks alike is alike."""
 
-from __future__ import annotations
-
 import unicodedata
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The surface of a fluid with dye, as its file has it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

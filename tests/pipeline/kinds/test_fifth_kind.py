@@ -1,7 +1,5 @@
 """A kind of body that the program has never heard of, brought in by one row: grains in free fall."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

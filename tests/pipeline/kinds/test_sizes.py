@@ -1,7 +1,5 @@
 """Sizes of bodies by the job alone, and what follows from them: the density of looks, and what a camera shows."""
 
-from __future__ import annotations
-
 import json
 from math import pi
 from pathlib import Path

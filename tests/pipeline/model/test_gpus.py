@@ -1,7 +1,5 @@
 """The GPUs that pictures are drawn on: what Blender tells of them, what is remembered, and what jobs make of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -9,7 +9,7 @@ from command_line import pipeline
 from places import PROJECT
 
 from pipeline.base.layout import JobLayout
-from pipeline.base.task import FailureKind, Resources, TaskId
+from pipeline.base.task import FailureKind, Resources, Task, TaskId
 from pipeline.job.loading import load_job
 from pipeline.kinds.table import KINDS
 from pipeline.model.problems import Findings
@@ -181,27 +181,37 @@ def test_samples_are_those_that_blender_is_given():
     assert f'"samples": {tuple(SAMPLES.values())},' in settings
 
 
-def test_a_run_teaches_how_long_its_work_takes_here(tmp_path, monkeypatch):
+@pytest.fixture
+def rates(tmp_path, monkeypatch) -> None:
+    """Those of the reference are what is known of this machine."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     keep(REFERENCE)
-    job, layout = drop(tmp_path), JobLayout(tmp_path / "drop")
-    teacher = Teacher(job, layout, TWO_CORES)
+
+
+def teacher_of(job, folder: Path, *, particles: int) -> Teacher:
+    """Of a job whose first frame is there and has so many particles."""
+    layout = JobLayout(folder)
     frame = layout.path(layout.frame_cache(0))
     frame.parent.mkdir(parents=True)
-    write_frame(
-        frame,
-        {"water": Snapshot("fluid", {"position": np.zeros((50_000, 3), np.float32)}, {})},
-        FrameReport(0, 0.0, {}, {}, {}),
-        device="cpu",
-    )
+    water = Snapshot("fluid", {"position": np.zeros((particles, 3), np.float32)}, {})
+    write_frame(frame, {"water": water}, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
+    return Teacher(job, layout, TWO_CORES)
+
+
+def commit_all(teacher: Teacher, task: Task) -> None:
+    for artifact in task.outputs:
+        receipt = Receipt(artifact, task.id, task.stage, 1, "", "", size=1000, mtime_ns=0, hash="")
+        teacher.notify(Committed(task.id, 1, receipt))
+
+
+def test_a_run_teaches_how_long_its_work_takes_here(tmp_path, rates):
+    job = drop(tmp_path)
+    teacher = teacher_of(job, tmp_path / "drop", particles=50_000)
     assert teacher.elements()["fluid"] == 50_000
     tasks = planned(job, ["simulate"])
     usual = simulation(expect(job, tasks, Size({"fluid": 50_000.0}, 1), TWO_CORES)).seconds
     teacher.notify(RunStarted(tasks))
-    for number in range(20):
-        artifact = tasks[0].task.outputs[number]
-        receipt = Receipt(artifact, TaskId("simulate"), "simulate", 1, "", "", size=1000, mtime_ns=0, hash="")
-        teacher.notify(Committed(TaskId("simulate"), 1, receipt))
+    commit_all(teacher, tasks[0].task)
     teacher.notify(Failed(TaskId("simulate"), 1, FailureKind.CANCELLED, "", seconds=0.5 * usual))  # stopped by hand
     teacher.notify(Finished(TaskId("simulate"), 2, 2.5 * usual, 10**9))
     teacher.teach()
@@ -223,40 +233,24 @@ def test_check_and_plan_tell_the_cost(tmp_path, monkeypatch):
     assert "simulate: about" in result.output
 
 
-def test_a_small_run_teaches_nothing(tmp_path, monkeypatch):
+def test_a_small_run_teaches_nothing(tmp_path, rates):
     """It would tell how long a start takes, and make films of the same kind look as slow."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    keep(REFERENCE)
-    job, layout = drop(tmp_path), JobLayout(tmp_path / "drop")
-    frame = layout.path(layout.frame_cache(0))
-    frame.parent.mkdir(parents=True)
-    water = Snapshot("fluid", {"position": np.zeros((100, 3), np.float32)}, {})
-    write_frame(frame, {"water": water}, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
-    teacher, tasks = Teacher(job, layout, TWO_CORES), planned(job, ["simulate"])
+    job = drop(tmp_path)
+    teacher, tasks = teacher_of(job, tmp_path / "drop", particles=100), planned(job, ["simulate"])
     teacher.notify(RunStarted(tasks))
-    for artifact in tasks[0].task.outputs:
-        receipt = Receipt(artifact, TaskId("simulate"), "simulate", 1, "", "", size=1000, mtime_ns=0, hash="")
-        teacher.notify(Committed(TaskId("simulate"), 1, receipt))
+    commit_all(teacher, tasks[0].task)
     teacher.notify(Finished(TaskId("simulate"), 1, 60.0, 10**9))
     teacher.teach()
     assert known_rates() == REFERENCE
 
 
-def test_tiny_pictures_teach_nothing_of_large_ones(tmp_path, monkeypatch):
+def test_tiny_pictures_teach_nothing_of_large_ones(tmp_path, rates):
     """They are overhead: a film after them was expected to take a tenth of its time."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    keep(REFERENCE)
     job = drop(tmp_path, "render.resolution=[32,18]", "render.samples=1")
-    layout = JobLayout(tmp_path / "drop")
-    frame = layout.path(layout.frame_cache(0))
-    frame.parent.mkdir(parents=True)
-    water = Snapshot("fluid", {"position": np.zeros((50_000, 3), np.float32)}, {})
-    write_frame(frame, {"water": water}, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
-    teacher, tasks = Teacher(job, layout, TWO_CORES), planned(job)
+    teacher, tasks = teacher_of(job, tmp_path / "drop", particles=50_000), planned(job)
     teacher.notify(RunStarted(tasks))
     for each in (each.task for each in tasks if each.task.stage == "render"):
-        receipt = Receipt(each.outputs[0], each.id, "render", 1, "", "", size=1000, mtime_ns=0, hash="")
-        teacher.notify(Committed(each.id, 1, receipt))
+        commit_all(teacher, each)
         teacher.notify(Finished(each.id, 1, 0.2, 10**8))
     teacher.teach()
     assert known_rates() == REFERENCE

@@ -1,7 +1,5 @@
 """How much a job will write, and the reserve that stays free."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import click

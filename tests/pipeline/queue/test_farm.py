@@ -1,7 +1,5 @@
 """The queue of a farm, by real processes: jobs take turns, obey, survive their runners, and none is lost."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """A farm's runner among troubles: busy folders, disks that refuse, jobs that change or go while another one runs."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

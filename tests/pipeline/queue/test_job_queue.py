@@ -1,7 +1,5 @@
 """The queue: order, commands, damaged files, and processes that are killed in the middle of changing it."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

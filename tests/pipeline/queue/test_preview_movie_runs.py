@@ -1,7 +1,5 @@
 """The preview movie while a job runs: which frames it shows, when it goes, and what it cannot harm."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

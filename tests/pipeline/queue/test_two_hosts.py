@@ -3,8 +3,6 @@
 The whole, with partitions of the real length: `pytest -m "slow or nightly" tests/pipeline/queue/test_two_hosts.py`.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

@@ -1,7 +1,5 @@
 """`submit --until`: a job that ends after a stage, needs nothing of what comes after it, and goes on later."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Watching a run of another process: what counts is how that run ended."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

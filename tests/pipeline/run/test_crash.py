@@ -1,7 +1,5 @@
 """Killed anywhere, as often as you like: the next run continues, and the bytes are those of an undisturbed run."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal

@@ -1,7 +1,5 @@
 """Runs that somebody disturbs: who interrupts them, takes them over, or loses what they told or made."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

@@ -1,7 +1,5 @@
 """The order in which frames take their turns."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

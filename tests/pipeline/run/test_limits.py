@@ -1,7 +1,5 @@
 """Limits of a stage's tasks: what they end, with which evidence, and that they decide no output."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Hand-over to other farms: the template is valid, and running it gives what `submit` gives."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

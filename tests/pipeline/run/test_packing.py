@@ -1,7 +1,5 @@
 """Which tasks run beside which: what they need, machines that come and go, and who may overtake whom."""
 
-from __future__ import annotations
-
 import pytest
 from scheduled_tasks import TWO_CORES, commit, fail, film, started, succeed, task
 

@@ -1,7 +1,5 @@
 """What the user sees of a run."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import re

@@ -1,7 +1,5 @@
 """Whole runs over the synthetic stages: what runs, what does not run again, and how faults end."""
 
-from __future__ import annotations
-
 import errno
 import os
 import sqlite3

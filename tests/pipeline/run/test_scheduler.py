@@ -1,7 +1,5 @@
 """The scheduler: events in, instructions out; nothing here touches a clock, a file or a process."""
 
-from __future__ import annotations
-
 import pickle
 import random
 

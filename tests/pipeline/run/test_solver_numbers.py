@@ -1,7 +1,5 @@
 """What the solvers tell of a job: the last frame's numbers, and warnings counted over all frames."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """`pipeline compare` and `pipeline loop`: films side by side, and small films that start again."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The gallery tells what was submitted and drawn, not what the job file of today says, and keeps what is not drawn."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which frames of a job belong together, by what receipts tell of them and of what they were made from."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The report: one file with charts of the solvers' numbers, timings, pictures and warnings; several jobs in one."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """The report in a real browser without a network: its charts are drawn, told by hovering and zoomed by dragging."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report as a browser shows it: one file with its film, versions and job file, and nothing from elsewhere."""
 
-from __future__ import annotations
-
 import io
 import socket
 from dataclasses import replace

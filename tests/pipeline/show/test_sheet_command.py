@@ -1,7 +1,5 @@
 """`pipeline still --sheet`: frames of a job on one picture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import drawing_stages

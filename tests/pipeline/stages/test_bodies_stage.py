@@ -1,7 +1,5 @@
 """Meshes of bodies, and which of them keep the texture coordinates of their files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

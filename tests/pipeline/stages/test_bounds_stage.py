@@ -1,7 +1,5 @@
 """Where a film's action is, from its cached frames; and what it makes of the plan."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from inline_tasks import run_task

@@ -1,7 +1,5 @@
 """Cloth through the pipeline: what is planned for it, and the mesh that Blender gets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which device drew a frame is on record, and a film of several is warned of."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

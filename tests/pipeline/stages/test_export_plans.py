@@ -1,7 +1,5 @@
 """What exports plan and refuse, without any file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

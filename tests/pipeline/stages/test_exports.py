@@ -1,7 +1,5 @@
 """Exports, read by the libraries of the programs that they are for."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """What is told of a film that does not run on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

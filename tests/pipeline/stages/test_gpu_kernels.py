@@ -1,7 +1,5 @@
 """Cycles' kernels are compiled by one renderer while the others wait, whoever dies."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

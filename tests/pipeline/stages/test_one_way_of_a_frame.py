@@ -1,7 +1,5 @@
 """One way of a frame: its description is built once, its picture decoded once, its job validated once a process."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Writes in a thread beside the computing one: in order, bounded, and no error is lost."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import threading

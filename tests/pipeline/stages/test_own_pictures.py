@@ -1,7 +1,5 @@
 """What an HDRI and the textures of .blend files add to the memory of a renderer."""
 
-from __future__ import annotations
-
 import tracemalloc
 from math import prod
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The simulation as a task, run for real: which device its frames come from, and what a kill or a full disk leaves."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

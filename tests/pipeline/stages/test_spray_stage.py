@@ -1,7 +1,5 @@
 """Spray as tasks: what they are planned from, and what surface and drops make of frames in the cache."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

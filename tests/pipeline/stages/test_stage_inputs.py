@@ -1,7 +1,5 @@
 """What of the user's own files counts for a fingerprint: what is in them, not where they lie."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What the stages plan for a job, and what they tell Blender."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A film whose bodies have names of many scripts, and its exports as other programs read them."""
 
-from __future__ import annotations
-
 import pytest
 from films import JOB, Studio
 

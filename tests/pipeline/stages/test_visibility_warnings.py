@@ -1,7 +1,5 @@
 """What is told of a frame's camera before the frame is drawn, and how it gets to the user."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Smoke from the cache to OpenVDB: the same cells in the same places, and a clear line where that is impossible."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

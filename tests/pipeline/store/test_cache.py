@@ -1,7 +1,5 @@
 """The HDF5 cache gives back what was written, the same bytes each time, and refuses what is damaged."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Smoke in the cache: where it is, as exactly as pictures can show, and nothing of the empty space around it."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Receipts answer where files come from; flipped bits are found wherever they are, and just they are healed."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Receipts: which damage to a file or to its receipt is found, and that it does not count then."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

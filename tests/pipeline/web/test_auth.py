@@ -1,7 +1,5 @@
 """Access to the dashboard: hosts, sessions, tokens."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 from pathlib import Path

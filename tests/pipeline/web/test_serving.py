@@ -1,7 +1,5 @@
 """Serving of pages: ports, connections, and which requests to a viser page are refused."""
 
-from __future__ import annotations
-
 import asyncio
 import http.client
 import socket

@@ -2,6 +2,7 @@
 
 import pytest
 import taichi as ti
+from taichi.lang import kernel_impl
 
 
 @ti.kernel
@@ -35,3 +36,25 @@ def test_an_error_on_a_later_line_shows_that_line(taichi_cpu):
     said = str(raised.value).strip().splitlines()
     assert said[0].startswith(f'File "{__file__}", line ')
     assert said[1].strip().startswith("unheard_of")
+
+
+@ti.func
+def doubled(number: ti.f32) -> ti.f32:
+    return 2.0 * number
+
+
+@ti.kernel
+def eightfold(numbers: ti.types.ndarray(ti.f32, 1)):
+    for i in range(numbers.shape[0]):
+        numbers[i] = doubled(doubled(doubled(numbers[i])))
+
+
+def test_the_source_of_a_function_is_read_once_for_all_of_its_uses(taichi_cpu, monkeypatch):
+    read = []
+    read_lines = kernel_impl.getsourcelines
+    monkeypatch.setattr(kernel_impl, "getsourcelines", lambda code: read.append(code.co_name) or read_lines(code))
+    numbers = ti.ndarray(ti.f32, 3)
+    numbers.fill(1.5)
+    eightfold(numbers)
+    assert numbers.to_numpy().tolist() == [12.0] * 3
+    assert sorted(read) == ["doubled", "eightfold"]

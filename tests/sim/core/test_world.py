@@ -1,7 +1,5 @@
 """The world lands on frames exactly, restores, and names what diverged."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

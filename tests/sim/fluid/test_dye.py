@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 from small_fluids import EARTH, EVERY_FACE, lattice, run
-from thread_counts import digest_of, result_on_any_threads
+from thread_counts import digest_of
 
 from sim.build import build_world
 from sim.core.domain import DomainParameters
@@ -148,13 +148,6 @@ POUR = {
 }
 
 
-def poured(frames: int) -> str:
-    world = build_world(SceneParameters.model_validate(POUR), frames_per_second=30.0)
-    for _ in range(frames):
-        world.advance_frame()
-    return digest_of(world.checkpoint())
-
-
 def test_what_an_emitter_brings_has_its_dye_and_a_run_continues_to_the_bit(taichi_cpu):
     scene = SceneParameters.model_validate(POUR)
     whole, resumed = (build_world(scene, frames_per_second=30.0) for _ in range(2))
@@ -171,11 +164,6 @@ def test_what_an_emitter_brings_has_its_dye_and_a_run_continues_to_the_bit(taich
     for world in (whole, resumed):
         world.advance_frame()
     assert digest_of(whole.checkpoint()) == digest_of(resumed.checkpoint())
-
-
-@pytest.mark.slow
-def test_dye_has_the_same_bits_on_any_number_of_threads():
-    assert result_on_any_threads(poured, 5)
 
 
 @pytest.mark.parametrize(

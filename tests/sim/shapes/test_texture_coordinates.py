@@ -1,7 +1,5 @@
 """Texture coordinates of mesh files on the meshes of their solids, which are repaired."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

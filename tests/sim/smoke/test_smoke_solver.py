@@ -25,9 +25,9 @@ def plume(**changes) -> SmokeParameters:
     return SmokeParameters(**{"name": "plume", "cell_size": 1 / 16, "source": [SOURCE], **changes})
 
 
-def build_plume() -> SmokeSolver:
+def build_plume(**changes) -> SmokeSolver:
     obstacle = build_solid(Placement(**BALL, position=(0.0, 0.0, 0.7)))
-    return SmokeSolver(plume(), domain=DOMAIN, gravity=GRAVITY, solids=[obstacle])
+    return SmokeSolver(plume(**changes), domain=DOMAIN, gravity=GRAVITY, solids=[obstacle])
 
 
 def advance(solver: SmokeSolver, substeps: int) -> None:
@@ -260,12 +260,12 @@ def test_a_plain_box_takes_less_than_120_bytes_a_cell(monkeypatch):
 
 
 def digests_of_plumes() -> list[str]:
-    """As a small grid, and as a large one, whose coarse levels one thread computes."""
+    """Of a plume in gusts as a small grid, and as a large one, whose coarse levels one thread computes."""
     found = []
     for longest_ns in (scheduling.LONGEST_NS, 2.0e4):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(scheduling, "LONGEST_NS", longest_ns)
-            solver = build_plume()
+            solver = build_plume(wind=(0.5, 0.2, 0.0), turbulence={"strength": 2.0, "size": 0.2, "rate": 4.0})
             advance(solver, 6)
         found.append(digest_of(solver.checkpoint()))
     return found

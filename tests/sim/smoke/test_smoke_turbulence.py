@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from smoke_scenes import air_in, get_faces
-from thread_counts import digest_of, result_on_any_threads
 
 from sim.core.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
@@ -92,12 +91,3 @@ def test_it_drifts_with_the_wind():
 def test_eddies_that_cells_cannot_carry_are_refused():
     with pytest.raises(ValueError, match=r"turbulence.size: 0.08 m is less than two cells of 0.05 m"):
         Gusts(size=0.08)
-
-
-def digest_of_gusts() -> str:
-    return digest_of(dict(zip("xyz", Gusts(wind=(0.5, 0.0, 0.2)).at(0.7), strict=True)))
-
-
-@pytest.mark.slow
-def test_the_number_of_threads_does_not_change_a_bit():
-    assert len(result_on_any_threads(digest_of_gusts)) == 64

@@ -1,7 +1,5 @@
 """What `check` says of how much light gets through liquids and smoke."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

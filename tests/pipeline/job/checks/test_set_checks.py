@@ -1,7 +1,5 @@
 """What `check` says of a job's set and of the picture around the scene."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

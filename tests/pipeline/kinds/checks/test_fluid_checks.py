@@ -1,7 +1,5 @@
 """Jobs whose fluids cannot be meant together, or whose emitters cannot."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from checked_jobs import checked, says

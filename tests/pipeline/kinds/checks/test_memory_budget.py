@@ -1,7 +1,5 @@
 """A job has to fit into the memory of what computes it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

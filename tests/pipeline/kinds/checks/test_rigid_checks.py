@@ -1,7 +1,5 @@
 """Bodies that cannot start are refused with the job, not when its simulation starts."""
 
-from __future__ import annotations
-
 from pipeline.model.job import Job
 from pipeline.run.checked_job import check_job
 

@@ -1,7 +1,5 @@
 """Fixed time steps that the speeds of a job are too high for."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

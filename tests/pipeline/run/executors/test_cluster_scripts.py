@@ -1,7 +1,5 @@
 """The scripts for SLURM, run as SLURM runs them; and TLS."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

@@ -1,7 +1,5 @@
 """The executor on a Dask cluster: the contract of all executors, and what a cluster's losses cost."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import threading

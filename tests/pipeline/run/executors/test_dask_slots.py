@@ -1,7 +1,5 @@
 """Which Dask worker gets a task."""
 
-from __future__ import annotations
-
 from pipeline.base.task import Resources
 from pipeline.run.executors.dask_slots import Offer, Slots, offer_from
 

@@ -1,7 +1,5 @@
 """On which machines a job runs: what the options mean, and what is worth telling of the end."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

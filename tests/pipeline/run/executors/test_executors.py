@@ -1,7 +1,5 @@
 """The executors of one machine: the contract of all, and what the one with processes promises besides."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

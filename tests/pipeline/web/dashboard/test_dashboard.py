@@ -1,7 +1,5 @@
 """The dashboard over HTTP: what it shows, what it does, who may ask, and what goes wrong."""
 
-from __future__ import annotations
-
 import io
 import os
 import shutil

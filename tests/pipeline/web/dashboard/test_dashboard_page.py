@@ -1,7 +1,5 @@
 """The dashboard in a real browser: buttons work, frames arrive without a reload, it fits a phone."""
 
-from __future__ import annotations
-
 import re
 
 import av

@@ -1,7 +1,5 @@
 """Parts of the dashboard: glances at records, estimates, places, small pictures."""
 
-from __future__ import annotations
-
 import os
 import struct
 import threading

@@ -1,7 +1,5 @@
 """Several browsers at a session, one that does not read, one that goes and comes again, and what blows up meanwhile."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The page in a real browser: it draws, and what a mouse does there reaches the scene."""
 
-from __future__ import annotations
-
 import io
 import math
 import time

@@ -1,7 +1,5 @@
 """The loop of live by a clock of its own: how often a scene is computed and shown."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

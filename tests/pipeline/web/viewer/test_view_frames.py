@@ -1,7 +1,5 @@
 """Frames of a job as `pipeline view` reads them, before anything is drawn."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The loop behind the viewer's page, with a server but without a browser."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`pipeline view` in a real browser: what it draws, and what its controls do."""
 
-from __future__ import annotations
-
 import io
 import threading
 from collections.abc import Callable, Iterator
