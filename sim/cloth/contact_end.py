@@ -16,9 +16,9 @@ from sim.cloth.crossing_repair import repair_crossing
 from sim.cloth.patch_motion_kernels import (
     PAIRS_AT_A_TIME,
     PATCHES_AT_A_TIME,
-    WIDENED,
     finish_pair,
     finish_patch,
+    margin_after,
     measure_change,
 )
 from sim.core.arrays import Floats, Integers, Vectors
@@ -149,5 +149,5 @@ def end_lone_contacts(
         ti.loop_config(serialize=True)
     for m in range(patches_end):
         if counter[1] + counter[2] == 0:
-            margin[m] = ti.max(least, ti.select(is_changed == 1, WIDENED * change[m], 0.0))
+            margin[m] = margin_after(is_changed, change[m], margin[m], least)
     return ti.math.ivec3(counter[0], counter[1], counter[2])

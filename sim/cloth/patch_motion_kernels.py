@@ -43,7 +43,7 @@ WIDENED = 1.25
 """Contacts may push so many times as far as in the substep before without patches being looked at anew."""
 
 KEPT_MARGIN = 0.97
-"""Part of what they may that they keep for the next substep, whatever they did: what one pushes swings about a mean."""
+"""Part of what they may that they keep for the next substep, whatever they did: what they do swings about a mean."""
 
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
@@ -404,18 +404,27 @@ def measure_change(
         counter[2] = 1
 
 
+@ti.func
+def margin_after(is_changed: ti.i32, change: ti.f32, margin: ti.f32, least: ti.f32) -> ti.f32:
+    """How far contacts may displace a patch in the next substep without it being looked at anew [m].
+
+    `WIDENED` times what they did in this one, `KEPT_MARGIN` times what they might have, and `least` at least; only that
+    where they did nothing to any patch.
+    """
+    return ti.max(least, ti.select(is_changed == 1, ti.max(WIDENED * change, KEPT_MARGIN * margin), 0.0))
+
+
 @func
 def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: SubstepEnd):
-    """What a patch used up of the lists in a substep. If contacts changed it by more than `negligible` [m] it is fitted
-    anew; its margin for the next substep is `WIDENED` times what they did in this one, `KEPT_MARGIN` times what it was,
-    and `least_margin` [m] at least.
+    """What a patch used up of the lists in a substep, and its margin for the next one. If contacts changed it by more
+    than `negligible` [m] it is fitted anew.
     """
-    patches.budget.change[m] = ti.select(end.is_changed == 1, patches.budget.change[m], 0.0)
-    patches.budget.spent[m] += patches.budget.moves[m] + patches.budget.change[m] + end.astray
-    foreseen = ti.max(WIDENED * patches.budget.change[m], KEPT_MARGIN * patches.budget.margin[m])
-    patches.budget.margin[m] = ti.max(end.least_margin, foreseen)
-    patches.budget.more[m] = ti.max(patches.budget.margin[m] - end.half_thickness, 0.0)
-    if patches.budget.change[m] > end.negligible:
+    budget = ti.static(patches.budget)
+    budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
+    budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
+    budget.margin[m] = margin_after(end.is_changed, budget.change[m], budget.margin[m], end.least_margin)
+    budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
+    if budget.change[m] > end.negligible:
         fit_motion(m, end.still, patches.corners, nodes, patches.bounds)
 
 
