@@ -419,12 +419,12 @@ def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: Su
     """What a patch used up of the lists in a substep, and its margin for the next one. If contacts changed it by more
     than `negligible` [m] it is fitted anew.
     """
-    budget = ti.static(patches.budget)
-    budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
-    budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
-    budget.margin[m] = margin_after(end.is_changed, budget.change[m], budget.margin[m], end.least_margin)
-    budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
-    if budget.change[m] > end.negligible:
+    margin, change = patches.budget.margin[m], ti.select(end.is_changed == 1, patches.budget.change[m], 0.0)
+    patches.budget.change[m] = change
+    patches.budget.spent[m] += patches.budget.moves[m] + change + end.astray
+    patches.budget.margin[m] = margin_after(end.is_changed, change, margin, end.least_margin)
+    patches.budget.more[m] = ti.max(patches.budget.margin[m] - end.half_thickness, 0.0)
+    if change > end.negligible:
         fit_motion(m, end.still, patches.corners, nodes, patches.bounds)
 
 
