@@ -12,9 +12,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
+import pytest
+import synthetic_stages
+from command_line import pipeline as command
 from synthetic_jobs import job_text
-from synthetic_stages import write_faults
 
+import pipeline.queue.turns  # before stages are exchanged: modules that it imports keep the real ones
+import pipeline.stages
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import live_holder
 from pipeline.queue.job_queue import JobQueue
@@ -23,6 +27,7 @@ from pipeline.record.reader import AttemptRow, ManifestReader
 HERE = Path(__file__).resolve().parent
 PATIENCE_S = 900.0
 """Only a hang, or a very busy machine, gets here."""
+RUNS_TASKS = {"submit", "sweep", "resume", "rerun"}
 
 
 class Ended(NamedTuple):
@@ -44,12 +49,12 @@ class Farm:
         path = self.folder / f"{name}.toml"
         text = job_text(frames=frames, focal_length_mm=focal_length_mm)
         path.write_text(text.replace('name = "synthetic"', f'name = "{name}"'))
-        write_faults(self.layout(name).root, {}, pause_s=pause_s)
+        synthetic_stages.write_faults(self.layout(name).root, {}, pause_s=pause_s)
         return path
 
     def faults(self, name: str, faults: dict[str, list[str]], *, pause_s: float = 0.0) -> None:
         """Put faults into a job; from the next frame on each takes `pause_s`."""
-        write_faults(self.layout(name).root, faults, pause_s=pause_s)
+        synthetic_stages.write_faults(self.layout(name).root, faults, pause_s=pause_s)
 
     def layout(self, name: str) -> JobLayout:
         return JobLayout(self.folder / "renders" / name)
@@ -71,6 +76,17 @@ class Farm:
         """Run a command to its end; `code` is what it must exit with, None: whatever."""
         return self.finish(self.start(*arguments), code=code)
 
+    def here(self, *arguments: str, code: int = 0) -> Ended:
+        """Run a command to its end in this process, its tasks too: starting others takes seconds."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(self.folder)
+            patch.setattr(pipeline.stages, "STAGES", synthetic_stages.STAGES)
+            patch.setattr(pipeline.queue.turns, "STAGES_REFERENCE", synthetic_stages.REFERENCE)
+            executor = ("--executor", "inline") if arguments[0] in RUNS_TASKS else ()
+            result = command(*arguments, *executor)
+        assert result.exit_code == code, result.output
+        return Ended(result.exit_code, result.stdout, result.stderr)
+
     @staticmethod
     def finish(process: subprocess.Popen[str], *, code: int | None = 0) -> Ended:
         out, err = process.communicate(timeout=PATIENCE_S)
@@ -79,7 +95,7 @@ class Farm:
         return Ended(process.returncode, out, err)
 
     def listed(self) -> dict[str, dict[str, Any]]:
-        listed = json.loads(self.run("status", "--json").out)
+        listed = json.loads(self.here("status", "--json").out)
         return {job["name"]: job for job in listed["jobs"]}
 
     def attempts(self, name: str) -> list[AttemptRow]:

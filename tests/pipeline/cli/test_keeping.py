@@ -89,14 +89,14 @@ def test_a_damaged_job_file_of_the_folder_is_replaced_by_the_one_that_is_submitt
     farm = Farm(tmp_path)
     farm.job("film", frames=2)
     layout = farm.layout("film")
-    farm.run("submit", "film.toml", "--executor", "inline")
+    farm.here("submit", "film.toml")
     whole = layout.job_file.read_bytes()
     layout.job_file.write_bytes(bytes([whole[0] ^ 0x80]) + whole[1:])
-    refused = farm.run("resume", "film", "--executor", "inline", code=2)
+    refused = farm.here("resume", "film", code=2)
     assert "not UTF-8 text (byte 0 is" in refused.err
     remedy = shlex.split(refused.err.strip().partition("is kept: ")[2])
-    assert farm.run("verify", "film", "--deep").code == 0
-    farm.run("submit", "film.toml", "--executor", "inline")
+    assert farm.here("verify", "film", "--deep").code == 0
+    farm.here("submit", "film.toml")
     assert layout.job_file.read_bytes() == (tmp_path / remedy[1]).read_bytes() == whole
     farm.close()
 
@@ -123,14 +123,14 @@ def test_a_garbled_manifest_is_told_with_the_remedy_and_healed_by_the_next_submi
     farm = Farm(tmp_path)
     farm.job("film", frames=2)
     layout = farm.layout("film")
-    farm.run("submit", "film.toml", "--executor", "inline")
+    farm.here("submit", "film.toml")
     made = len([*layout.receipts.rglob("*.json")])
     layout.manifest.write_bytes(content)
-    told = farm.run("status", "film", code=1).err
+    told = farm.here("status", "film", code=1).err
     assert "manifest.db is damaged" in told and "Traceback" not in told
     assert told.strip().endswith("pipeline verify renders/film --rebuild")
-    healed = farm.run("submit", "film.toml", "--executor", "inline")
+    healed = farm.here("submit", "film.toml")
     assert f"was damaged and is made anew of {made} receipts" in healed.err
     assert {attempt.message for attempt in farm.attempts("film")} == {"known from its receipt"}
-    assert "up to date" in farm.run("submit", "film.toml").out
+    assert "up to date" in farm.here("submit", "film.toml").out
     farm.close()

@@ -1,4 +1,4 @@
-"""The queue of a farm, by real processes: jobs take turns, obey, survive their runners, and none is lost."""
+"""The queue of a farm whose commands are real processes where several take part: jobs take turns, and none is lost."""
 
 import os
 import shutil
@@ -87,7 +87,7 @@ def test_a_job_submitted_detached_runs_in_the_background_and_can_be_watched(farm
     submitted = farm.run("submit", farm.job("a", pause_s=0.1).name, "--detach")
     assert "a is queued; the queue runs in the background" in submitted.out
     assert not submitted.out.startswith("renders/")
-    assert farm.run("status", "a", "--follow").code == 0
+    assert farm.here("status", "a", "--follow").code == 0
     wait_until(lambda: farm.settled("a"), "it was never settled")
     assert_done_once(farm, "a", like=undisturbed)
 
@@ -117,20 +117,20 @@ def test_ctrl_c_while_a_job_of_somebody_else_runs_pauses_the_own_one_and_leaves_
     farm.faults("other", {})
     wait_until(lambda: farm.settled("other"), "it did not go on in the background")
     assert_long_done_once(farm, "other", begins=undisturbed)
-    farm.run("cancel", "own")
+    farm.here("cancel", "own")
 
 
 @pytest.mark.slow
 def test_paused_resumed_and_nothing_is_done_twice(farm, undisturbed):
     submitted = start_long(farm, "a")
-    assert "a pauses as soon as what runs is finished" in farm.run("pause", "a").out
+    assert "a pauses as soon as what runs is finished" in farm.here("pause", "a").out
     stopped = farm.finish(submitted, code=8)
     assert "asked to pause" in stopped.err
     assert farm.listed()["a"]["state"] == "paused"
     assert 0 < farm.frames_done("a") < 60
-    assert farm.run("status", "a", "--follow", code=8).err.strip().endswith("continue with: pipeline resume renders/a")
+    assert farm.here("status", "a", "--follow", code=8).err.strip().endswith("continue with: pipeline resume renders/a")
     farm.faults("a", {})
-    farm.run("resume", "a")
+    farm.here("resume", "a")
     assert_long_done_once(farm, "a", begins=undisturbed)
     assert farm.queue.listing().jobs == ()
 
@@ -142,13 +142,13 @@ def test_cancelled_stops_at_once_and_keeps_what_is_finished(farm):
     farm.faults("a", {}, pause_s=600.0)
     waiting = farm.start("submit", farm.job("b").name)
     wait_until(lambda: farm.queue.find("b") is not None, "it was never queued")
-    assert "b is cancelled" in farm.run("cancel", "b").out
+    assert "b is cancelled" in farm.here("cancel", "b").out
     assert "it was cancelled before it ran" in farm.finish(waiting, code=8).err
-    farm.run("cancel", "a")
+    farm.here("cancel", "a")
     assert "cancelled: stopping at once" in farm.finish(running, code=8).err
     assert 0 < farm.frames_done("a") < 6
     assert farm.queue.listing().jobs == ()
-    assert '"a" is not in the queue' in farm.run("cancel", "a", code=1).err
+    assert '"a" is not in the queue' in farm.here("cancel", "a", code=1).err
 
 
 @pytest.mark.slow
@@ -157,9 +157,9 @@ def test_cancelled_while_its_own_command_runs_a_more_urgent_job(farm):
     farm.job("urgent", pause_s=600.0)
     urgent = farm.start("submit", "urgent.toml", "--priority", "5")
     wait_until(lambda: farm.is_running("urgent"), "the more urgent job never ran")
-    farm.run("cancel", "low")
+    farm.here("cancel", "low")
     farm.faults("urgent", {})
-    farm.run("cancel", "urgent")
+    farm.here("cancel", "urgent")
     farm.finish(urgent, code=8)
     farm.finish(low, code=8)
     assert farm.queue.listing().jobs == ()
@@ -169,12 +169,12 @@ def test_cancelled_while_its_own_command_runs_a_more_urgent_job(farm):
 def test_failed_tasks_are_tried_again_by_rerun(farm, undisturbed):
     path = farm.job("a")
     farm.faults("a", {"double/000002": ["fail"]})
-    farm.run("submit", path.name, code=5)
+    farm.here("submit", path.name, code=5)
     failed = farm.listed()["a"]
     assert (failed["state"], failed["done"], failed["tasks"]) == ("failed", 6, 8)
     assert failed["note"] == "double/000002: ValueError: a fault of the task's own"
-    assert "it failed: double/000002" in farm.run("status", "a", "--follow", code=5).err
-    farm.run("rerun", "--failed", "a")
+    assert "it failed: double/000002" in farm.here("status", "a", "--follow", code=5).err
+    farm.here("rerun", "--failed", "a")
     assert_done_once(farm, "a", like=undisturbed)
 
 
@@ -229,31 +229,31 @@ def test_another_version_submitted_meanwhile_follows_and_both_commands_end_well(
 @pytest.mark.slow
 def test_a_folder_moved_elsewhere_continues_there(farm, tmp_path, undisturbed):
     submitted = start_long(farm, "a")
-    farm.run("pause", "a")
+    farm.here("pause", "a")
     farm.finish(submitted, code=8)
     farm.faults("a", {})
     elsewhere = tmp_path / "another disk" / "films"
     elsewhere.mkdir(parents=True)
     shutil.move(farm.layout("a").root, elsewhere / "mine")
-    done = farm.run("resume", str(elsewhere / "mine"))
+    done = farm.here("resume", str(elsewhere / "mine"))
     assert done.out.startswith(f"{elsewhere.relative_to(tmp_path)}/mine/movie.mp4")
     moved = contents(elsewhere / "mine")
     assert len(moved) == 121
     assert all(moved[each] == content for each, content in undisturbed.items() if each != "film.bin")
     # The old place neither makes it anew nor forgets it without a word.
     assert farm.listed()["a"]["state"] == "paused"
-    farm.run("rerun", "--failed", "a", code=1)
+    farm.here("rerun", "--failed", "a", code=1)
     assert not farm.layout("a").job_file.exists()
     assert "is gone" in farm.listed()["a"]["note"]
-    farm.run("cancel", "a")
+    farm.here("cancel", "a")
 
 
 @pytest.mark.slow
 def test_a_disk_that_gets_too_full_pauses_the_job_and_more_room_continues_it(farm, undisturbed):
-    refused = farm.run("submit", farm.job("a").name, "--reserve", "1000TB", code=7)
+    refused = farm.here("submit", farm.job("a").name, "--reserve", "1000TB", code=7)
     assert "less than the reserve" in refused.err
     entry = farm.queue.find("a")
     assert entry is not None
     assert (entry.desired, farm.frames_done("a")) == (Desired.PAUSE, 0)
-    farm.run("resume", "a", "--reserve", "0")
+    farm.here("resume", "a", "--reserve", "0")
     assert_done_once(farm, "a", like=undisturbed)

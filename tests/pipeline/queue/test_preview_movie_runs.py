@@ -36,8 +36,9 @@ def without_pauses(monkeypatch) -> None:
     """Films as often as they can be made, and tasks that draw."""
     monkeypatch.setattr("pipeline.queue.preview_movie.SHORTEST_PAUSE_S", 0.01)
     monkeypatch.setattr("pipeline.queue.preview_movie.SHARE", 1.0e6)
-    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
+    # What is imported for it keeps the real stages.
     monkeypatch.setattr("pipeline.queue.turns.STAGES_REFERENCE", drawing_stages.REFERENCE)
+    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
 
 
 def write_job(folder: Path, *, frames: int = FRAMES, gravity: float = -9.0, more: str = "") -> Path:

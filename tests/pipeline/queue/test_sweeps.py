@@ -5,12 +5,11 @@ import errno
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
-import synthetic_stages
 from command_line import pipeline
-from farm_processes import Ended, Farm, wait_until
+from farm_processes import Farm, wait_until
 from PIL import Image
 from synthetic_stages import step_artifact
 
@@ -31,22 +30,6 @@ def farm(tmp_path) -> Iterator[Farm]:
     farm.close()
 
 
-@pytest.fixture
-def run(farm, monkeypatch) -> Callable[..., Ended]:
-    """A command of the farm in this process, whose tasks are done in it, too; it must end well."""
-    monkeypatch.chdir(farm.folder)
-    monkeypatch.setattr("pipeline.stages.STAGES", synthetic_stages.STAGES)
-    monkeypatch.setattr("pipeline.queue.turns.STAGES_REFERENCE", synthetic_stages.REFERENCE)
-
-    def command(name: str, *arguments: str, code: int = 0) -> Ended:
-        executor = ("--executor", "inline") if name in ("submit", "sweep") else ()
-        result = pipeline(name, *arguments, *executor)
-        assert result.exit_code == code, result.output
-        return Ended(result.exit_code, result.stdout, result.stderr)
-
-    return command
-
-
 def steps_taken(farm: Farm, name: str) -> int:
     """How often the simulation of a job really ran: attempts that are known from a receipt took no time here."""
     return sum(row.task == "steps" and row.seconds is not None for row in farm.attempts(name))
@@ -56,36 +39,36 @@ def inodes(layout: JobLayout, pattern: str) -> list[int]:
     return [path.stat().st_ino for path in sorted(layout.root.glob(pattern))]
 
 
-def test_a_sweep_over_the_camera_simulates_once(farm, run):
+def test_a_sweep_over_the_camera_simulates_once(farm):
     farm.job("a")
-    run("sweep", "a.toml", *CAMERAS)
+    farm.here("sweep", "a.toml", *CAMERAS)
     assert (steps_taken(farm, NEAR), steps_taken(farm, FAR)) == (1, 0)
     near, far = farm.layout(NEAR), farm.layout(FAR)
     assert inodes(near, "steps/*.bin") == inodes(far, "steps/*.bin")
     assert not set(inodes(near, "double/*.bin")) & set(inodes(far, "double/*.bin"))
-    assert "0 not as committed" in run("verify", FAR, "--deep").out
+    assert "0 not as committed" in farm.here("verify", FAR, "--deep").out
 
 
-def test_a_sweep_over_the_physics_shares_nothing(farm, run):
+def test_a_sweep_over_the_physics_shares_nothing(farm):
     farm.job("a")
-    run("sweep", "a.toml", *GRAVITIES)
+    farm.here("sweep", "a.toml", *GRAVITIES)
     names = sorted(path.parent.name for path in farm.queue.farm.glob("*/job.toml"))
     assert [steps_taken(farm, name) for name in names] == [1, 1]
 
 
-def test_what_is_removed_or_edited_in_one_job_stays_in_the_others(farm, run):
+def test_what_is_removed_or_edited_in_one_job_stays_in_the_others(farm):
     farm.job("a")
-    run("sweep", "a.toml", *CAMERAS)
+    farm.here("sweep", "a.toml", *CAMERAS)
     before = {path.name: path.read_bytes() for path in farm.layout(FAR).root.glob("steps/*.bin")}
-    run("clean", NEAR, "--stage", "steps", "--yes")
+    farm.here("clean", NEAR, "--stage", "steps", "--yes")
     assert not inodes(farm.layout(NEAR), "steps/*.bin")
     assert {path.name: path.read_bytes() for path in farm.layout(FAR).root.glob("steps/*.bin")} == before
     # The same command brings it back, from the other one.
-    run("sweep", "a.toml", *CAMERAS)
+    farm.here("sweep", "a.toml", *CAMERAS)
     assert inodes(farm.layout(NEAR), "steps/*.bin") == inodes(farm.layout(FAR), "steps/*.bin")
     assert steps_taken(farm, NEAR) == 1
     shutil.rmtree(farm.layout(NEAR).root)
-    assert "0 not as committed" in run("verify", FAR, "--deep").out
+    assert "0 not as committed" in farm.here("verify", FAR, "--deep").out
 
 
 def test_a_sweep_that_was_killed_goes_on_where_it_stopped(farm):
@@ -102,12 +85,12 @@ def test_a_sweep_that_was_killed_goes_on_where_it_stopped(farm):
     made = [near.path(step_artifact(k)) for k in range(12) if read_receipt(near, step_artifact(k)) is not None]
     before = [path.stat().st_ino for path in made]
     assert before
-    farm.run("sweep", "a.toml", *CAMERAS)
+    farm.here("sweep", "a.toml", *CAMERAS)
     assert [path.stat().st_ino for path in made] == before
     assert farm.frames_done(NEAR) == farm.frames_done(FAR) == 12
     assert steps_taken(farm, FAR) == 0
     assert all((farm.layout(name).root / "film.bin").is_file() for name in (NEAR, FAR))
-    assert farm.run("sweep", "a.toml", *CAMERAS).err.count("finished already") == 2
+    assert farm.here("sweep", "a.toml", *CAMERAS).err.count("finished already") == 2
 
 
 def test_a_detached_sweep_shares_as_well(farm):
@@ -117,29 +100,29 @@ def test_a_detached_sweep_shares_as_well(farm):
     assert (steps_taken(farm, NEAR), steps_taken(farm, FAR)) == (1, 0)
 
 
-def test_a_dry_run_names_the_jobs_and_makes_nothing(farm, run):
+def test_a_dry_run_names_the_jobs_and_makes_nothing(farm):
     farm.job("a")
     shutil.rmtree(farm.queue.farm, ignore_errors=True)
-    told = run("sweep", "a.toml", *CAMERAS, *GRAVITIES, "--dry-run").out
+    told = farm.here("sweep", "a.toml", *CAMERAS, *GRAVITIES, "--dry-run").out
     assert told.count("a-focal_length_mm-") == 4
     assert "4 jobs:" in told
     assert "12 files shared with a job before" in told  # six steps of each of two gravities
     assert not farm.queue.farm.exists()
 
 
-def test_all_that_is_wrong_with_all_jobs_is_told_at_once(farm, run):
+def test_all_that_is_wrong_with_all_jobs_is_told_at_once(farm):
     farm.job("a")
-    told = run("sweep", "a.toml", "--set", "gravty=[0,0,1],[0,0,2]", "--set", "camera.focal=3,4", code=2)
+    told = farm.here("sweep", "a.toml", "--set", "gravty=[0,0,1],[0,0,2]", "--set", "camera.focal=3,4", code=2)
     assert told.err.count('no key "gravty"') == 1
     assert told.err.count('no key "focal"') == 1
-    told = run("sweep", "a.toml", "--set", "frames=0,2", "--set", "fps=-1,5", code=2)
+    told = farm.here("sweep", "a.toml", "--set", "frames=0,2", "--set", "fps=-1,5", code=2)
     assert "frames" in told.err
     assert "fps" in told.err
 
 
-def test_files_are_copied_where_there_are_no_hard_links(farm, run, tmp_path, monkeypatch):
+def test_files_are_copied_where_there_are_no_hard_links(farm, tmp_path, monkeypatch):
     farm.job("a")
-    run("submit", "a.toml")
+    farm.here("submit", "a.toml")
 
     def refuse(*_: object) -> None:
         raise OSError(errno.EXDEV, "two disks")
@@ -157,9 +140,9 @@ def test_files_are_copied_where_there_are_no_hard_links(farm, run, tmp_path, mon
 
 
 @pytest.mark.parametrize("loses", [lambda path: path.unlink(), lambda path: path.write_bytes(b"made anew")])
-def test_what_another_job_removes_or_makes_anew_meanwhile_is_made_here(farm, run, tmp_path, monkeypatch, loses):
+def test_what_another_job_removes_or_makes_anew_meanwhile_is_made_here(farm, tmp_path, monkeypatch, loses):
     farm.job("a")
-    run("submit", "a.toml")
+    farm.here("submit", "a.toml")
     owner, layout = farm.layout("a"), JobLayout(tmp_path / "renders" / "b")
     layout.root.mkdir()
     receipt = read_receipt(owner, step_artifact(0))

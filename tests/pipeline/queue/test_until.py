@@ -155,14 +155,14 @@ def test_a_plain_submit_continues_to_the_film_and_the_queue_keeps_the_goal_of_a_
     path = farm.job("a", frames=60, pause_s=1.0)
     running = farm.start("submit", path.name, "--until", "double")
     wait_until(lambda: farm.frames_done("a") > 0, "it never began to work")
-    farm.run("pause", "a")
+    farm.here("pause", "a")
     farm.finish(running, code=8)
     farm.faults("a", {})
-    assert "renders/a (until double): done" in farm.run("resume", "a").out
+    assert "renders/a (until double): done" in farm.here("resume", "a").out
     film = farm.layout("a").root / "film.bin"
     assert (farm.frames_done("a"), film.exists()) == (60, False)
     assert farm.listed()["a"]["state"] == "done"
-    farm.run("submit", "a")
+    farm.here("submit", "a")
     assert film.exists()
     assert read_goal(farm.layout("a")) == ()
     succeeded = [row.task for row in farm.attempts("a") if row.outcome == SUCCEEDED]

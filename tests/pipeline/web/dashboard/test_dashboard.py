@@ -37,7 +37,7 @@ def page_of(client: Client, name: str, query: str = "") -> str:
 def failed_job(farm: Farm, name: str) -> None:
     farm.job(name)
     farm.faults(name, {"double/000002": ["fail"]})
-    farm.run("submit", f"{name}.toml", code=5)
+    farm.here("submit", f"{name}.toml", code=5)
 
 
 def queued_job(farm: Farm, name: str, **fields: object) -> None:
@@ -48,7 +48,7 @@ def queued_job(farm: Farm, name: str, **fields: object) -> None:
 # --- what it shows ---
 def test_every_job_is_shown_with_its_state_tasks_reasons_and_logs(farm: Farm) -> None:
     farm.job("good")
-    farm.run("submit", "good.toml")
+    farm.here("submit", "good.toml")
     failed_job(farm, "bad")
     queued_job(farm, "late")
     with dashboard(farm) as (client, _):
@@ -433,7 +433,7 @@ def test_another_address_than_the_loopback_has_a_token_of_its_own(farm: Farm) ->
 
 # --- what goes wrong ---
 def test_a_folder_that_is_not_there_is_told(farm: Farm) -> None:
-    assert "there is no folder nowhere" in farm.run("dashboard", "--farm", "nowhere", code=1).err
+    assert "there is no folder nowhere" in farm.here("dashboard", "--farm", "nowhere", code=1).err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -138,7 +138,7 @@ def test_a_report_draws_its_charts_and_runs_no_script_of_others(farm: Farm) -> N
 def test_tasks_are_found_and_their_logs_read_while_what_is_typed_stays(farm: Farm) -> None:
     farm.job("bad")
     farm.faults("bad", {"double/000002": ["fail"]})
-    farm.run("submit", "bad.toml", code=5)
+    farm.here("submit", "bad.toml", code=5)
     with dashboard(farm) as (client, _), open_page() as page:
         page.goto(f"http://{client.place}/jobs/bad")
         page.get_by_placeholder("Find a task").fill("double/00000")
