@@ -2,7 +2,8 @@
 
 import pytest
 import taichi as ti
-from taichi.lang import kernel_impl
+
+from sim.core.bundles import kernel_impl
 
 
 @ti.kernel
