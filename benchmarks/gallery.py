@@ -28,7 +28,7 @@ HEROES = {
     "ball_into_cloth": 34,
     "cloth_over_bunny": 22,
     "dam_break": 36,
-    "drop_on_bunny_dfsph": 60,
+    "drop_on_bunny_dfsph": 186,
     "drop_on_bunny_wcsph": 186,
     "duck_in_pool_pcisph": 51,
     "everything": 126,

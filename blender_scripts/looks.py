@@ -28,7 +28,7 @@ MIST_GOES_FORWARD = 0.85
 """Share of the light through drops that are no points that keeps its direction [-]: the asymmetry of scattering by
 balls of water in geometric optics (Bohren & Huffman 1983). Scattered evenly, the rest carries as much light aside."""
 
-SMALLEST_DROP = 0.75
+SMALLEST_DROP = 1.0
 """Radius of drops at least [pixels]; fewer of these stand for smaller ones."""
 
 BENT_BY_DROPS = 2

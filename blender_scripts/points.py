@@ -107,8 +107,8 @@ def _spheres(name: str, material: Any, smallest_angle: float | None) -> Any:
 def _seen(group: Any, radius: Any, smallest_angle: float) -> tuple[Any, Any]:
     """The output sockets of the radii that spheres are drawn in, and of which of them are.
 
-    Those that the camera sees at a smaller angle [rad] are drawn at it, and as many fewer as they cover more: the light
-    that they let pass stays the same. A sphere's lot goes by its radius, so that it has the same one in every frame.
+    Those that the camera sees at a smaller angle [rad] are drawn at it, and as many fewer: their volume stays the same.
+    A sphere's lot goes by its radius, so that it has the same one in every frame.
     """
     nodes = group.nodes
 
@@ -134,7 +134,7 @@ def _seen(group: Any, radius: Any, smallest_angle: float) -> tuple[Any, Any]:
     group.links.new(node("GeometryNodeInputPosition"), away.inputs[0])
     group.links.new(camera.outputs["Location"], away.inputs[1])
     drawn = math("MAXIMUM", radius, math("MULTIPLY", away.outputs["Value"], smallest_angle))
-    share = math("POWER", math("DIVIDE", radius, drawn), 2.0)
+    share = math("POWER", math("DIVIDE", radius, drawn), 3.0)
     lot = nodes.new("FunctionNodeRandomValue")
     lot.data_type = "FLOAT"
     group.links.new(node("FunctionNodeHashValue", radius, data_type="FLOAT"), lot.inputs["ID"])

@@ -40,7 +40,7 @@ def pictures(tmp_path_factory) -> list[np.ndarray]:
     half_a_pixel = 0.5 / PIXELS_PER_METRE
     clouds = {
         DROP: (MIDDLE, RADIUS),
-        MIST: (random.uniform([-0.5, 0.0, 0.3], [0.5, 0.3, 0.7], (800, 3)), 0.4 * half_a_pixel),
+        MIST: (random.uniform([-0.5, 0.0, 0.3], [0.5, 0.3, 0.7], (4000, 3)), 0.4 * half_a_pixel),
         DENSE: (random.uniform([-0.3, 0.0, 0.3], [0.3, 0.6, 0.7], (6000, 3)), 0.9 * half_a_pixel),
     }
     for frame in range(5):
@@ -94,9 +94,10 @@ def covered(picture: np.ndarray, empty: np.ndarray) -> float:
 
 
 def test_fewer_larger_drops_stand_for_those_that_no_pixel_shows(pictures):
-    """As many as leave the same free: of n in a box the share exp(-n pi r² / area)."""
-    free = np.exp(-800 * np.pi * (0.2 / PIXELS_PER_METRE) ** 2 / 0.4)
-    # A drop that is 1.5 pixels wide changes pixels that it covers in part.
+    """Of one pixel, and of the same volume: of n in a box they leave the share exp(-n pi r² / area) free."""
+    number = 4000 * 0.2**3
+    free = np.exp(-number * np.pi / PIXELS_PER_METRE**2 / 0.4)
+    # A drop that is two pixels wide changes pixels that it covers in part.
     assert 1.0 < covered(pictures[MIST], pictures[EMPTY]) / (1.0 - free) < 4.0
     behind = np.median((pictures[MIST] - pictures[EMPTY])[14:22, 22:42], axis=(0, 1))
     assert np.abs(behind).max() < 4, "between them is what was there"
