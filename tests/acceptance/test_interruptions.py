@@ -79,18 +79,17 @@ def interrupt_while_worker_stands_still(studio: Studio, stage: str, *, times: in
 
 
 @pytest.mark.slow
-def test_ctrl_c_once_keeps_a_checkpoint_that_the_simulation_continues_from(splash: Studio, tmp_path: Path) -> None:
-    film = splash.copy(tmp_path)
-    film.run("clean", "tiny", "--stage", "simulate", "--yes").assert_code(0)
-    stopped = interrupt_while_worker_stands_still(film, "simulate", times=1).assert_code(130)
+def test_ctrl_c_once_keeps_a_checkpoint_that_the_simulation_continues_from(finished: Studio, reference: Studio) -> None:
+    finished.run("clean", "tiny", "--stage", "simulate", "--yes").assert_code(0)
+    stopped = interrupt_while_worker_stands_still(finished, "simulate", times=1).assert_code(130)
     assert "continue with: pipeline resume renders/tiny" in stopped.err
-    assert len(film.artifacts()) < len(splash.artifacts())
-    checkpoint = max(film.layout.checkpoints.glob("[0-9]*.h5"))
-    film.run("resume", "tiny").assert_code(0)
-    assert f"starting at frame {int(checkpoint.stem)}\n" in film.run("explain", "tiny", "simulate", "--log").out
-    film.assert_whole(like=splash)
+    assert len(finished.artifacts()) < len(reference.artifacts())
+    checkpoint = max(finished.layout.checkpoints.glob("[0-9]*.h5"))
+    finished.run("resume", "tiny").assert_code(0)
+    assert f"starting at frame {int(checkpoint.stem)}\n" in finished.run("explain", "tiny", "simulate", "--log").out
+    finished.assert_whole(like=reference)
     # The frames came out the same, so nothing that is made of them was made again.
-    assert {task for task, count in film.attempts().items() if count > 1} == {"simulate"}
+    assert {task for task, count in finished.attempts().items() if count > 1} == {"simulate"}
 
 
 @pytest.mark.slow
