@@ -14,6 +14,7 @@ from blender_scripts.errors import RenderInputError
 from blender_scripts.geometry import new_object, set_attribute
 from blender_scripts.ply import KINDS, POINT, drawn_radii
 from blender_scripts.ply import read_points as read_rows
+from blender_scripts.shading import NodeBuilder
 
 
 @dataclass(frozen=True)
@@ -85,58 +86,33 @@ def _spheres(name: str, material: Any, smallest_angle: float | None) -> Any:
     group = bpy.data.node_groups.new(f"{name} spheres", "GeometryNodeTree")
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    nodes, links = group.nodes, group.links
-    vertices, spheres = nodes.new("NodeGroupInput"), nodes.new("NodeGroupOutput")
-    named = nodes.new("GeometryNodeInputNamedAttribute")
+    builder = NodeBuilder(group, "NodeGroupOutput")
+    named = builder.node("GeometryNodeInputNamedAttribute", Name="radius")
     named.data_type = "FLOAT"
-    named.inputs["Name"].default_value = "radius"
     radius = named.outputs["Attribute"]
-    to_points = nodes.new("GeometryNodeMeshToPoints")
+    to_points = builder.node("GeometryNodeMeshToPoints", Mesh=builder.node("NodeGroupInput").outputs[0])
     if smallest_angle is not None:
-        radius, is_drawn = _seen(group, radius, smallest_angle)
-        links.new(is_drawn, to_points.inputs["Selection"])
-    painted = nodes.new("GeometryNodeSetMaterial")
-    painted.inputs["Material"].default_value = material
-    links.new(vertices.outputs[0], to_points.inputs["Mesh"])
-    links.new(radius, to_points.inputs["Radius"])
-    links.new(to_points.outputs[0], painted.inputs["Geometry"])
-    links.new(painted.outputs[0], spheres.inputs[0])
+        radius, is_drawn = _seen(builder, radius, smallest_angle)
+        builder.link(is_drawn, to_points.inputs["Selection"])
+    builder.link(radius, to_points.inputs["Radius"])
+    builder.geometry(builder.node("GeometryNodeSetMaterial", Geometry=to_points.outputs[0], Material=material))
     return group
 
 
-def _seen(group: Any, radius: Any, smallest_angle: float) -> tuple[Any, Any]:
+def _seen(builder: NodeBuilder, radius: Any, smallest_angle: float) -> tuple[Any, Any]:
     """The output sockets of the radii that spheres are drawn in, and of which of them are.
 
     Those that the camera sees at a smaller angle [rad] are drawn at it, and as many fewer: their volume stays the same.
     A sphere's lot goes by its radius, so that it has the same one in every frame.
     """
-    nodes = group.nodes
-
-    def node(kind: str, *values: Any, **properties: Any) -> Any:
-        made = nodes.new(kind)
-        for key, value in properties.items():
-            setattr(made, key, value)
-        sockets = [socket for socket in made.inputs if socket.enabled]
-        for socket, value in zip(sockets, values, strict=False):
-            if isinstance(value, bpy.types.NodeSocket):
-                group.links.new(value, socket)
-            else:
-                socket.default_value = value
-        return next(socket for socket in made.outputs if socket.enabled)
-
-    def math(operation: str, *values: Any) -> Any:
-        return node("ShaderNodeMath", *values, operation=operation)
-
-    camera = nodes.new("GeometryNodeObjectInfo")
-    group.links.new(node("GeometryNodeInputActiveCamera"), camera.inputs["Object"])
-    away = nodes.new("ShaderNodeVectorMath")
-    away.operation = "DISTANCE"
-    group.links.new(node("GeometryNodeInputPosition"), away.inputs[0])
-    group.links.new(camera.outputs["Location"], away.inputs[1])
-    drawn = math("MAXIMUM", radius, math("MULTIPLY", away.outputs["Value"], smallest_angle))
-    share = math("POWER", math("DIVIDE", radius, drawn), 3.0)
-    lot = nodes.new("FunctionNodeRandomValue")
-    lot.data_type = "FLOAT"
-    group.links.new(node("FunctionNodeHashValue", radius, data_type="FLOAT"), lot.inputs["ID"])
-    value = next(socket for socket in lot.outputs if socket.enabled)
-    return drawn, node("FunctionNodeCompare", value, share, data_type="FLOAT", operation="LESS_THAN")
+    camera = builder.node("GeometryNodeObjectInfo", Object=builder.node("GeometryNodeInputActiveCamera").outputs[0])
+    position = builder.node("GeometryNodeInputPosition").outputs[0]
+    away = builder.vector_math("DISTANCE", position, camera.outputs["Location"])
+    drawn = builder.math("MAXIMUM", radius, builder.math("MULTIPLY", away, smallest_angle))
+    share = builder.math("POWER", builder.math("DIVIDE", radius, drawn), 3.0)
+    hashed, lot = builder.node("FunctionNodeHashValue"), builder.node("FunctionNodeRandomValue")
+    hashed.data_type = lot.data_type = "FLOAT"
+    # Both have a socket of the same name for each type of data.
+    builder.link(radius, next(socket for socket in hashed.inputs if socket.enabled))
+    builder.link(hashed.outputs[0], lot.inputs["ID"])
+    return drawn, builder.math("LESS_THAN", next(socket for socket in lot.outputs if socket.enabled), share)

@@ -104,13 +104,13 @@ class LookContext:
 
 
 class NodeBuilder:
-    """Builds the node tree of a material or a world.
+    """Builds the node tree of a material or a world, or a group of nodes.
 
     Inputs of nodes are numbers, vectors, colours as three numbers, and output sockets of other nodes.
     """
 
     def __init__(self, owner: Any, output: str = "ShaderNodeOutputMaterial") -> None:
-        self.tree = node_tree_of(owner)
+        self.tree = owner if isinstance(owner, bpy.types.NodeTree) else node_tree_of(owner)
         self._output = self.tree.nodes.new(output)
 
     def node(self, kind: str, **inputs: Any) -> Any:
@@ -192,6 +192,10 @@ class NodeBuilder:
     def volume(self, shader: Any) -> None:
         """Use a node's first output as the inside."""
         self.link(shader.outputs[0], self._output.inputs["Volume"])
+
+    def geometry(self, node: Any) -> None:
+        """Use a node's first output as what a group makes."""
+        self.link(node.outputs[0], self._output.inputs["Geometry"])
 
     def _calculation(self, kind: str, operation: str, operands: tuple[Any, ...]) -> Any:
         node = self.tree.nodes.new(kind)

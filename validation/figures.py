@@ -11,6 +11,7 @@ from validation.checks import TITLES, CaseResult
 
 THEORY = "#222222"
 SHADES = ("#2a6fbb", "#d1652b", "#2f8f5b", "#8a5fb0")
+FINER = ("#a9c8ea", "#5f9bd6", "#1d4f86")  # of one curve at finer and finer resolutions
 COLOURS = {**dict.fromkeys(TITLES, SHADES[0]), "dfsph": SHADES[1], "pcisph": SHADES[2], "semi_lagrangian": SHADES[1]}
 
 mpl.rcParams.update(

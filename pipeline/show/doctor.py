@@ -42,6 +42,10 @@ from render.volume import import_openvdb
 vdb = import_openvdb()
 print('OpenVDB', '.'.join(map(str, vdb.LIBRARY_VERSION)) if hasattr(vdb, 'LIBRARY_VERSION') else '')
 """
+_GRAPHS_PROBE = """
+from sim.core.cuda_launch import makes_graphs
+assert makes_graphs(), 'threads have no folders of their own here'
+"""
 _CODEC_PROBE = """
 import av
 av.codec.Codec('libx264', 'w')
@@ -131,7 +135,11 @@ def _examine_devices() -> Iterable[Examination]:
     from sim.core.runtime import available_devices
 
     for device, answer in available_devices().items():
-        if answer == "ok":
+        if answer == "ok" and device == "cuda":
+            with_graphs, reason = _run_child(_GRAPHS_PROBE)
+            how = "launched as graphs" if with_graphs else f"launched one by one, which is slower: {reason}"
+            yield Examination("device cuda", "ok", f"computes; kernels are {how}")
+        elif answer == "ok":
             yield Examination(f"device {device}", "ok", "computes")
         elif device == "cpu":
             yield Examination("device cpu", "failed", answer, _SYNC)

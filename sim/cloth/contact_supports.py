@@ -47,7 +47,7 @@ def hold(c: ti.i32, contacts: Contacts, most: ti.f32, sums: NodeSums):
 
 @func
 def support_between(i: ti.i32, held_sums: Integers, lighter: ti.f32) -> ti.math.vec3:
-    """Brace of a vertex of which a body's share of a contact's mobility is `lighter` times its own; 0 if free."""
+    """Support of a vertex of which a body's share of a contact's mobility is `lighter` times its own; 0 if free."""
     stands, presses = ti.math.vec3(0.0), ti.math.vec3(0.0)
     for axis in ti.static(range(3)):
         stands[axis] = ti.cast(held_sums[6 * i + axis], ti.f32)

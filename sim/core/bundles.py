@@ -24,16 +24,13 @@ Taichi 1.7 reads the source of a kernel, as `sim.core.runtime` does.
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
-import textwrap
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache
-from types import CodeType
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import taichi as ti
 from taichi.lang import kernel_impl
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 SEPARATOR = "__"  # between the names of a bundle and its field, in that of an argument
 
@@ -128,58 +125,22 @@ class _Fields:
         return self._context.get_var_by_name(name)
 
 
-@cache
-def _source_of(code: CodeType) -> tuple[list[str], str, int, str]:
-    """Lines of a function, the same as text that begins in the first column, number of the first, and file."""
-    lines, first = kernel_impl.getsourcelines(code)
-    lines = [line.expandtabs(4).rstrip() for line in lines]
-    return lines, textwrap.dedent("\n".join(lines)), first, kernel_impl.getsourcefile(code)
-
-
-def _read_source(
-    kernel: Any,
-    excluded_parameters: Sequence[str] = (),
-    is_kernel: bool = True,
-    arg_features: Any = None,
-    args: Any = None,
-    ast_builder: Any = None,
-    is_real_function: bool = False,
-) -> tuple[ast.Module, ASTTransformerContext]:
-    """As Taichi reads the source of a kernel, but with the fields of bundles as arguments, and from its file once.
-
-    Taichi reads that of a function for each call that kernels have of it, thousands in all: much of the tracing time.
-    """
-    lines, text, first, file = _source_of(kernel.func.__code__)
-    tree = ast.parse(text)  # anew, as tracing leaves its results on the nodes
-    definition = tree.body[0]
-    assert isinstance(definition, ast.FunctionDef)
-    definition.decorator_list = []
-    names = kernel_impl._get_global_vars(kernel.func)
-    if is_kernel or is_real_function:
-        names |= {kernel.arguments[slot].name: args[slot] for slot in kernel.template_slot_locations}
-    context = ASTTransformerContext(
-        excluded_parameters=excluded_parameters,
-        is_kernel=is_kernel,
-        func=kernel,
-        arg_features=arg_features,
-        global_vars=names,
-        argument_data=args,
-        src=lines,
-        start_lineno=first,
-        file=file,
-        ast_builder=ast_builder,
-        is_real_function=is_real_function,
-    )
+def _read_source(kernel: Any, *args: Any, **keywords: Any) -> tuple[ast.Module, Any]:
+    """As Taichi reads the source of a kernel, but with the fields of bundles as arguments."""
+    tree, context = _taichi_reads_source(kernel, *args, **keywords)
     kinds = getattr(kernel.func, "__bundles__", ())
     if kinds:
-        arguments = definition.args
+        arguments = tree.body[0].args
         written, arguments.args = arguments.args, []
         for argument, kind in zip(written, kinds, strict=True):
             for name, _ in _leaves(argument.arg, kind):
                 arguments.args.append(ast.copy_location(ast.arg(name, argument.annotation), argument))
             if kind is not None:
-                names[argument.arg] = _Fields(argument.arg, kind, context, kernel.func.__used__)
+                context.global_vars[argument.arg] = _Fields(argument.arg, kind, context, kernel.func.__used__)
     return tree, context
 
 
+_taichi_reads_source = kernel_impl._get_tree_and_ctx
 kernel_impl._get_tree_and_ctx = _read_source
+# Taichi finds the lines of a function in its file for each call that kernels have of it, thousands in all.
+kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)

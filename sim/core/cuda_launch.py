@@ -222,6 +222,11 @@ def _loaded(ptx: bytes, entries: Sequence[tuple[str, str, int]]) -> Tasks:
     return Tasks(context.value, tasks)
 
 
+def makes_graphs() -> bool:
+    """Whether this system lets kernels be graphs; where not, Taichi launches each, as `pipeline doctor` says."""
+    return _compiling_thread() is not None
+
+
 def watched(first_launch: Callable[[], Any]) -> tuple[Any, list[bytes]]:
     """What a call returns, and the PTX that Taichi wrote in it, if any."""
     compiling = _compiling_thread()

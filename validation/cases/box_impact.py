@@ -22,11 +22,18 @@ REFERENCE = Path(__file__).resolve().parents[2] / "tests" / "reference" / "box_i
 TANK, WATER_LENGTH, WATER_DEPTH = (3.22, 1.0, 1.0), 1.228, 0.55  # [m]
 BOX, FACE = (0.161, 0.403, 0.161), 2.3955  # size of the box, and how far its face is from the wall behind the water [m]
 HEIGHTS = (0.021, 0.061, 0.101, 0.141)  # of the sensors [m]
+COLUMNS = ("times", "P1", "P2", "P3", "P4")  # of a record
 PATCH = 0.04, 0.2  # height and width of what counts as a sensor: a few particles, in the plane part of the flow [m]
 ARRIVAL = 1000.0  # pressure from which on water has reached a sensor [Pa]
 FIRST, CUT = 0.36, 0.0025  # from when on, and how often, pressures are taken [s]
 MEAN_OF = 4  # samples of the running mean that is drawn
 COMPARED = (0.06, 0.28)  # span after the first contact in which they are averaged [s]
+
+IDEAL = (
+    "free streamlines of a jet as thick as 0.6 of the box's height have 0.77 of the foot's pressure at 0.101 m, "
+    "0.49 at 0.141 m, the record 0.85 and 0.78: what holds the water back there is not in an ideal flow"
+)
+BOUNDS = ((0.2, "a few particles make a sensor up"), (0.3, "likewise"), (0.4, IDEAL), (0.75, IDEAL))  # by sensor
 
 
 def measured() -> np.ndarray:
@@ -96,23 +103,18 @@ def find(solver: str, spacing: Sequence[float], end: float) -> Found:
     finest = runs[-1]
     first, later = arrivals(finest)[0], arrivals(finest) - arrivals(record)
     ratio = means(finest) / means(record)
-    ideal = (
-        "free streamlines of a jet as thick as 0.6 of the box's height have 0.77 of the foot's pressure at 0.101 m, "
-    )
-    ideal += "0.49 at 0.141 m, the record 0.85 and 0.78: what holds the water back there is not in an ideal flow"
-    bounds = {0.2: "a few particles make a sensor up", 0.3: "likewise", 0.4: ideal, 0.75: ideal}
     checks = [
         Check("first contact over the measured one", first / arrivals(record)[0], 1.0, 0.08,
               "20 ms at all resolutions and with all solvers; the clock of the record starts with a gate"),
         Check("how much longer than measured the water takes from the first to the third sensor", later[2] - later[0],
               0.0, 0.03, "the time in which the front comes a few spacings farther", "s"),
-        *(Check(f"mean pressure at {height:g} m over the measured one", float(each), 1.0, bound, reason)
-          for height, each, (bound, reason) in zip(HEIGHTS, ratio, bounds.items(), strict=True)),
+        *(Check(f"mean pressure at {height:g} m over the measured one", float(each), 1.0, *bound)
+          for height, each, bound in zip(HEIGHTS, ratio, BOUNDS, strict=True)),
     ]  # fmt: skip
     return checks, {"spacing": list(spacing)} | {
         f"{name}_{each:g}": run[:, column].tolist()
         for each, run in zip(spacing, runs, strict=True)
-        for column, name in enumerate(("times", "P1", "P2", "P3", "P4"))
+        for column, name in enumerate(COLUMNS)
     }
 
 
@@ -124,7 +126,7 @@ def draw(results: Sequence[CaseResult]) -> Figure:
         axes.plot(record[:, 0] - arrivals(record)[0], record[:, sensor] / 1000.0, color=THEORY, label="MARIN")
         for result in results:
             times, *pressures = (np.array(result.series[f"{name}_{min(result.series['spacing']):g}"])
-                                 for name in ("times", "P1", "P2", "P3", "P4"))  # fmt: skip
+                                 for name in COLUMNS)  # fmt: skip
             since = times - arrivals(np.stack([times, *pressures], axis=1))[0]
             mean = np.convolve(pressures[sensor - 1], np.full(MEAN_OF, 1.0 / MEAN_OF), mode="same")
             axes.plot(since, mean / 1000.0, linewidth=0.8, **style_of(result))

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from sim.core.domain import DomainParameters
 from validation.cases import Case, Found
 from validation.checks import TITLES, CaseResult, Check
-from validation.figures import THEORY, label_axes, make_panels, style_of
+from validation.figures import FINER, THEORY, label_axes, make_panels, style_of
 from validation.scenes import GRAVITY, lattice, make_fluid, recorded, state_of
 
 REFERENCE = Path(__file__).resolve().parents[2] / "tests" / "reference" / "dam_break_front.csv"
@@ -116,7 +116,7 @@ def draw(results: Sequence[CaseResult]) -> Figure:
         finest = max(result.series["columns"])
         solvers.plot(result.series[f"times_{finest}"], result.series[f"fronts_{finest}"], **style_of(result))
     series = results[0].series
-    for count, shade in zip(series["columns"], ("#a9c8ea", "#5f9bd6", "#1d4f86"), strict=True):
+    for count, shade in zip(series["columns"], FINER, strict=True):
         resolutions.plot(series[f"times_{count}"], series[f"fronts_{count}"], color=shade, label=f"width / {count}")
     label_axes(solvers, "T = t (2 g / width)^(1/2)", "front / width", f"solvers, spacing width / {finest}")
     label_axes(resolutions, "T", "front / width", f"{TITLES[results[0].solver]}, refinement")

@@ -7,8 +7,6 @@ Hydrodynamics, 11.42; hodograph of a source and a sink on a quarter of a circle)
     z / a = 4/pi (arctan v + artanh v),    p = rho U²/2 (1 - v²),    force on the wall = rho U² a for each metre across
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,7 +16,7 @@ from matplotlib.figure import Figure
 from sim.core.domain import DomainParameters
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check
-from validation.figures import THEORY, label_axes, make_panels, style_of
+from validation.figures import FINER, THEORY, label_axes, make_panels, style_of
 from validation.scenes import WATER, WEIGHTLESS, advance, lattice, make_fluid, state_of, wall_forces
 
 THICKNESS, SPEED = 0.08, 2.0  # a [m] and U [m/s]
@@ -103,7 +101,7 @@ def draw(results: Sequence[CaseResult]) -> Figure:
         solvers.plot(
             result.series[f"pressure_{finest}"], result.series["heights"], "o", markersize=3, **style_of(result)
         )
-    for count, shade in zip(results[0].series["layers"], ("#a9c8ea", "#5f9bd6", "#1d4f86"), strict=False):
+    for count, shade in zip(results[0].series["layers"], FINER, strict=False):
         resolutions.plot(
             results[0].series[f"pressure_{count}"],
             results[0].series["heights"],

@@ -12,6 +12,8 @@ from command_line import pipeline
 from pipeline.show import doctor
 from pipeline.show.doctor import Examination, examine, print_report
 from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
+from sim.core import runtime
+from sim.core.cuda_launch import makes_graphs
 
 
 @pytest.mark.slow
@@ -70,6 +72,18 @@ def test_table_for_people_holds_every_finding(capsys):
     table = capsys.readouterr().out
     for word in ("failed", "disk", "full [very]", "delete", "cpu", "computes"):
         assert word in table
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_device_whose_kernels_are_launched_one_by_one_is_told(monkeypatch, refused):
+    monkeypatch.setattr(runtime, "available_devices", lambda: {"cpu": "ok", "cuda": "ok"})
+    if refused:
+        probe = doctor._GRAPHS_PROBE.replace("assert", "makes_graphs = lambda: False\nassert", 1)
+        monkeypatch.setattr(doctor, "_GRAPHS_PROBE", probe)
+    cuda = next(each for each in doctor._examine_devices() if each.name == "device cuda")
+    with_graphs = makes_graphs() and not refused
+    assert cuda.status == "ok"
+    assert ("as graphs" in cuda.detail, "slower: threads" in cuda.detail) == (with_graphs, not with_graphs)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="libraries of Linux")
