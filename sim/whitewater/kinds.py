@@ -9,8 +9,8 @@ GAMMA_ORDER = 4.0
 splashes."""
 
 LIGAMENT_ORDER = 4.0
-"""The same of the widths of ligaments, which drops are about as large as: of sheets that break up (Kooij et al. 2018,
-"What determines the drop size in sprays?", a compound Gamma distribution)."""
+"""The same of the widths of ligaments, which drops are about as large as: a compound Gamma distribution, as sheets that
+break up have (Kooij et al. 2018, "What determines the drop size in sprays?"), of an order that looks like a splash."""
 MEAN_SHARE = 0.5
 """Drops of a ligament of mean width, at most, as a share of what one particle may be: thinner ones have more [-]."""
 LARGEST_SHARE = 0.5
