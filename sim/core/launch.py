@@ -25,6 +25,7 @@ from taichi.lang.matrix import VectorType
 from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
 
+from sim.core.array_memory import free_given_up
 from sim.core.bundles import field_paths, flattened, is_used, with_fields_as_arguments
 from sim.core.cuda_launch import Graph, HostBuffers, Tasks, tasks_of
 
@@ -140,6 +141,7 @@ class FastKernel:
         On a CPU arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in
         every launch. With CUDA it does so unless it has no size of them; addresses are put where it would have them.
         """
+        free_given_up()
         kernel, executable, tasks = compiled
         context, buffers, handles = None, None, []
         if self._on_cpu or self._on_cuda:

@@ -159,6 +159,8 @@ def _start_taichi(device: str, threads: int) -> None:
     ti = import_taichi()
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
+    from sim.core.array_memory import free_in_this_thread
+
     ASTTransformerContext.get_pos_info = _unwrapped_position
     kernel_cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or cache_folder() / "kernels")
     _remove_stale_lock(kernel_cache)
@@ -175,6 +177,7 @@ def _start_taichi(device: str, threads: int) -> None:
             default_ip=ti.i32,
             random_seed=0,
         )
+    free_in_this_thread()
 
 
 def _unwrapped_position(context: Any, node: ast.expr | ast.stmt) -> str:
