@@ -10,6 +10,7 @@ import taichi as ti
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
+from sim.core.reductions import BRANCHES, LaneReduction, Share, Tree, reduced_tree
 from sim.fluid.boundary import Bodies, NearParticles
 from sim.fluid.kernels import (
     Discretization,
@@ -30,11 +31,11 @@ TENSION_VISCOSITY = 0.07
 """Viscosity of fluid with tension besides its own, over sqrt(sigma d/rho0). The force of a curvature is no derivative
 of an energy and drives what is a few spacings small; this damps it, and takes 0.12 sqrt(d/R) of a drop's frequency."""
 
-PACKING = 0.85
+PACKING = 0.83
 """Gradients at a flat lattice's surface over those of a drop at rest, whose outer layer its own pressure packs until it
 has rest density: the force on it is that much less for the same tension."""
 
-BLEND_AT_WALL = 0.7  # share of the next layer's normal in that of the layer on a wall; the contact angle gives the rest
+BLEND_AT_WALL = 0.4  # share of the next layer's normal in that of the layer on a wall; the contact angle gives the rest
 SEEN_WALL = 0.02  # h |grad c| of a wall from which on a particle lies on it [-]
 LEAST_TANGENT = 0.2  # share of a gradient along a wall from which on it tells where the fluid ends [-]
 LEAST_GRADIENT = 0.15  # h |grad c|, smoothed, of particles that have a curvature [-]; 0.9 at a surface, 0.04 within
@@ -135,8 +136,9 @@ class SurfaceTensionCSF:
     g's part along the wall (Brackbill et al., eq. 53). That is right at the wall; half a spacing above it the next
     layer's normal counts as well. A body that moves gets sigma along the surface for each length of the contact line.
 
-    Fluids have a surface each: two that touch have both tensions between them. Momentum is conserved as far as the sum
-    of k n over a closed surface is 0, which nothing enforces.
+    Fluids have a surface each: two that touch have both tensions between them. The sum of k n over a closed surface
+    is 0. As long as no fluid is on a wall, what the sum over particles has is taken from them by their share of the
+    surface, so that momentum is conserved. Else it stays.
     """
 
     def __init__(self, capacity: int, fluids: tuple[FluidParameters, ...], discretization: Discretization) -> None:
@@ -155,6 +157,7 @@ class SurfaceTensionCSF:
             ti.ndarray(ti.f32, capacity),
             ti.Vector.ndarray(3, ti.f32, capacity),
         )
+        self._reduction = LaneReduction(maxima=0, sums=5)
         self._gain = PACKING * smoothing_loss(discretization.support_in_spacings)
 
     def add_acceleration(self, fluid: Fluid, acceleration: ti.Ndarray) -> None:
@@ -164,7 +167,9 @@ class SurfaceTensionCSF:
         smooth_gradients(fluid, self._gradient, self._contact, interface)
         compute_curvatures(fluid, interface, spacing, curvature)
         average_at_surface(fluid, interface, curvature, self._mean_curvature)
-        add_surface_force(fluid, interface, self._mean_curvature, self._gain, acceleration)
+        share, force = self._reduction.over(fluid.particles.count), self._gradient  # which has been read
+        compute_surface_force(fluid, interface, self._contact, self._mean_curvature, self._gain, force, share)
+        add_surface_force(fluid, interface, force, share.tree, acceleration)
 
     def fill_forces(self, fluid: Fluid, near: NearParticles, bodies: Bodies, force: ti.Ndarray) -> None:
         """Pull of the surface on each sample of a moving body [N], along the contact line."""
@@ -348,19 +353,58 @@ def average_at_surface(fluid: Fluid, interface: Interface, curvature: Floats, me
         mean[i] = k_i
 
 
+@func
+def pulled_share(gradient: ti.f32) -> ti.f32:
+    """h |grad c| of a particle, less where it is no more than noise [-]."""
+    return gradient * ti.min(ti.max(gradient - NO_PULL, 0.0) / (FULL_PULL - NO_PULL), 1.0)
+
+
 @kernel
-def add_surface_force(fluid: Fluid, interface: Interface, curvature: Floats, gain: ti.f32, acceleration: Vectors):
-    """a_i -= 2 C sigma k_i |<grad c>| n_i/rho0, less where the gradient is no more than noise."""
+def compute_surface_force(
+    fluid: Fluid, interface: Interface, contact: Contact, curvature: Floats, gain: ti.f32, force: Vectors, share: Share
+):
+    """a_i = -2 C sigma k_i |<grad c>| n_i/rho0; in the tree its sum [N], and those of surface mass and of walls."""
+    particles, materials = ti.static((fluid.particles, fluid.materials))
+    lanes = share.tree.lanes
+    for lane in range(lanes):
+        total = ti.math.vec3(0.0)
+        mass = 0.0
+        on_wall = 0.0
+        for item in range(share.items):
+            i = lane * share.lane_step + item * share.item_step
+            if i < particles.count:
+                own = particles.phase[i]
+                k_i, a_i = 0.0, ti.math.vec3(0.0)
+                pulled = pulled_share(interface.gradient[i])
+                if pulled > 0.0:
+                    k_i = mean_curvature(fluid, interface, curvature, i)
+                    strength = 2.0 * gain * materials.surface_tension[own] / materials.rest_density[own]
+                    a_i = -strength * k_i * pulled * fluid.inverse_support * interface.normal[i]
+                m_i = fluid.volume * materials.rest_density[own]
+                total += m_i * a_i
+                mass += m_i * pulled
+                on_wall += contact.on_wall[i]
+                force[i] = a_i
+                interface.curvature[i] = k_i
+        for axis in ti.static(range(3)):
+            share.tree.partial[axis * lanes + lane] = total[axis]
+        share.tree.partial[3 * lanes + lane] = mass
+        share.tree.partial[4 * lanes + lane] = on_wall
+    reduced_tree(share.tree)
+
+
+@kernel
+def add_surface_force(fluid: Fluid, interface: Interface, force: Vectors, tree: Tree, acceleration: Vectors):
+    """a_i += the force by curvature, without its sum, by share of the surface, where no fluid is on a wall."""
+    stride = tree.lanes // BRANCHES
     ti.loop_config(block_dim=128)
     for i in range(fluid.particles.count):
-        k_i = 0.0
-        size, own = interface.gradient[i], fluid.particles.phase[i]
-        if size > NO_PULL:
-            k_i = mean_curvature(fluid, interface, curvature, i)
-            share = ti.min((size - NO_PULL) / (FULL_PULL - NO_PULL), 1.0)
-            tension = fluid.materials.surface_tension[own] / fluid.materials.rest_density[own]
-            acceleration[i] -= 2.0 * gain * tension * share * k_i * size * fluid.inverse_support * interface.normal[i]
-        interface.curvature[i] = k_i
+        change = force[i]
+        mass = tree.nodes[3 * stride]
+        if tree.nodes[4 * stride] == 0.0 and mass > 0.0:
+            net = ti.math.vec3(tree.nodes[0], tree.nodes[stride], tree.nodes[2 * stride])
+            change -= pulled_share(interface.gradient[i]) / mass * net
+        acceleration[i] += change
 
 
 @kernel
