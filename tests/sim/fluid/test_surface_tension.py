@@ -121,8 +121,14 @@ def test_a_drop_of_4_mm_swings_at_rayleighs_frequency_about_laplaces_pressure(ta
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "angle", "start"),
-    [("dfsph", 60.0, 100.0), ("dfsph", 60.0, 40.0), ("dfsph", 90.0, 120.0), ("dfsph", 120.0, 90.0)]
-    + [("wcsph", 60.0, 90.0), ("pcisph", 60.0, 90.0)],
+    [
+        ("dfsph", 60.0, 100.0),
+        ("dfsph", 60.0, 40.0),
+        ("dfsph", 90.0, 120.0),
+        ("dfsph", 120.0, 90.0),
+        ("wcsph", 60.0, 100.0),
+        ("pcisph", 120.0, 90.0),
+    ],
 )
 def test_a_drop_on_a_plate_takes_its_contact_angle(taichi_cpu, solver, angle, start):
     """From above and from below; the angle is that of the cap of the drop's volume with its centre as high."""
@@ -176,21 +182,22 @@ def test_threads_grow_fastest_at_the_wavelength_of_rayleigh_and_plateau(taichi_c
         )
         fluid = csf_fluid(space, points[np.hypot(points[:, 1], points[:, 2]) < profile], spacing)
         scale = math.sqrt(1000.0 * radius**3 / WATER)
-        wave = []
-        for _ in range(7):
-            run(fluid, scale)
-            x = position(fluid)[:, 0]
-            wave.append(
-                float(np.cos(math.pi * x / length).mean())
-            )  # 0 for an even thread, the wave's height for a wavy one
-        rates.append(wave)
-    print(rates)
-    assert False
+        heights = []
+        for _ in range(2):
+            run(fluid, 2.0 * scale)
+            heights.append(float(np.cos(math.pi * position(fluid)[:, 0] / length).mean()))  # 0 for an even thread
+        rates.append(math.log(max(heights[1], 1e-3) / heights[0]) / 2.0)
+    assert rates[0] < 0.0  # shorter than the thread is around
+    curve = np.polyfit(1.0 / wavelengths[1:], rates[1:], 2)
+    assert curve[0] < 0.0
+    # Rayleigh 1878: 9.02 radii, at 0.34 over the root of rho R³/sigma.
+    assert -2.0 * curve[0] / curve[1] == pytest.approx(9.02, rel=0.15)
+    assert max(rates) == pytest.approx(0.34, rel=0.25)
 
 
 def test_a_body_gets_the_momentum_of_the_drop_that_it_carries(taichi_cpu):
     spacing, radius = 0.0004, 0.002
-    plate = lattice((-0.006, -0.006, -0.0008), (0.006, 0.006, 0.0), spacing)
+    plate = lattice((-0.006, -0.006, -spacing), (0.006, 0.006, 0.0), spacing)
     plate -= np.float32((0.0, 0.0, 0.45 * spacing))
     points = lattice((-radius, -radius, 0.0), (radius, radius, radius), spacing)
     material = {**CSF, "name": "water", "solver": "dfsph", "particle_radius": spacing / 2, "surface_tension": WATER}
@@ -213,8 +220,9 @@ def test_a_body_gets_the_momentum_of_the_drop_that_it_carries(taichi_cpu):
     before = fluid.diagnostics()["momentum_z"]
     run(fluid, 0.02)
     impulse, _ = fluid.body_forces.take_impulses()
-    print(impulse, fluid.diagnostics()["momentum_z"] - before, 2 * math.pi * radius * WATER * 0.02)
-    assert False
+    line = 2.0 * math.pi * radius * WATER  # pulls the plate up, and the pressure of the drop pushes it down as much
+    assert abs(fluid.diagnostics()["momentum_z"] - before) < 0.05 * line * 0.02
+    assert np.abs(impulse[0]).max() < 0.15 * line * 0.02
 
 
 @pytest.mark.parametrize(
