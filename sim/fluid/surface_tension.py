@@ -15,10 +15,8 @@ from sim.fluid.boundary import Bodies, NearParticles
 from sim.fluid.kernels import (
     Discretization,
     evaluate,
-    evaluate_slope,
     inverse_distance,
     lattice_offsets,
-    particle_volume,
     spline,
     spline_slope,
 )
@@ -31,15 +29,16 @@ TENSION_VISCOSITY = 0.07
 """Viscosity of fluid with tension besides its own, over sqrt(sigma d/rho0). The force of a curvature is no derivative
 of an energy and drives what is a few spacings small; this damps it, and takes 0.12 sqrt(d/R) of a drop's frequency."""
 
-PACKING = 0.83
-"""Gradients at a flat lattice's surface over those of a drop at rest, whose outer layer its own pressure packs until it
-has rest density: the force on it is that much less for the same tension."""
+GAIN = 0.976
+"""Factor on the smoothed gradients at a support of two spacings. In a lattice with a flat surface smoothing takes 15 %
+of their sum, which it leaves outside; in a drop at rest there is 20 % more, as pressure packs its outer layer."""
 
 CONTACT_LINE = 0.73
 """Length of a contact line over the sum of gradients along a wall: with it a drop at rest pulls as it pushes, to 7 %
 from 60 to 90 degrees; at 120 it pulls 16 % too little."""
 
 BLEND_AT_WALL = 0.4  # share of the next layer's normal in that of the layer on a wall; the contact angle gives the rest
+STEEPENING = 1.1  # of an angle below 90 degrees, from there: smoothing draws normals on a wall towards those above
 SEEN_WALL = 0.02  # h |grad c| of a wall from which on a particle lies on it [-]
 LEAST_TANGENT = 0.2  # share of a gradient along a wall from which on it tells where the fluid ends [-]
 LEAST_GRADIENT = 0.15  # h |grad c|, smoothed, of particles that have a curvature [-]; 0.9 at a surface, 0.04 within
@@ -125,12 +124,12 @@ class Contact(NamedTuple):
 class SurfaceTensionCSF:
     """Continuum surface force of each fluid against the air, by the curvature of its surface.
 
-        a_i = -2 C/rho0 sigma k_i <grad c>_i,   grad c = sum_j V grad W_ij + 1/2 sum_b V_b grad W_ib
+        a_i = 2 C/rho0 sigma k_i <grad c>_i,   grad c = sum_j V grad W_ij + 1/2 sum_b V_b grad W_ib
 
     after Brackbill, Kothe & Zemach 1992, in particles Morris 2000 and Müller et al. 2003. Here the gradient is smoothed
     once by the kernel, <g>_i = sum_j V g_j W_ij. So it is a field like that of gravity, which pressure balances without
     moving single particles, and vanishes within the fluid, where plain gradients are noise that a pressure would press
-    apart. C is what smoothing takes from it in a lattice, times `PACKING`.
+    apart. C is `GAIN`.
 
     k is the trace of the surface's shape operator, the least-squares slope of the unit normals along the surface over
     the neighbours, weighted by W |<g>|². Normals are those of the layers under the surface: with the principal
@@ -148,7 +147,8 @@ class SurfaceTensionCSF:
     def __init__(self, capacity: int, fluids: tuple[FluidParameters, ...], discretization: Discretization) -> None:
         """Prepare for particles of these fluids."""
         self._discretization = discretization
-        angles = np.radians([fluid.contact_angle_deg for fluid in fluids])
+        given = np.array([fluid.contact_angle_deg for fluid in fluids])
+        angles = np.radians(np.where(given < 90.0, 90.0 + STEEPENING * (given - 90.0), given))
         self._gradient = ti.Vector.ndarray(3, ti.f32, capacity)
         self._raw_curvature, self._mean_curvature = (ti.ndarray(ti.f32, capacity) for _ in range(2))
         self.interface = Interface(
@@ -162,7 +162,6 @@ class SurfaceTensionCSF:
             ti.Vector.ndarray(3, ti.f32, capacity),
         )
         self._reduction = LaneReduction(maxima=0, sums=5)
-        self._gain = PACKING * smoothing_loss(discretization.support_in_spacings)
 
     def add_acceleration(self, fluid: Fluid, acceleration: ti.Ndarray) -> None:
         """Add the accelerations by surface tension to all others [m/s²]."""
@@ -172,27 +171,12 @@ class SurfaceTensionCSF:
         compute_curvatures(fluid, interface, spacing, curvature)
         average_at_surface(fluid, interface, curvature, self._mean_curvature)
         share, force = self._reduction.over(fluid.particles.count), self._gradient  # which has been read
-        compute_surface_force(fluid, interface, self._contact, self._mean_curvature, self._gain, force, share)
+        compute_surface_force(fluid, interface, self._contact, self._mean_curvature, force, share)
         add_surface_force(fluid, interface, force, share.tree, acceleration)
 
     def fill_forces(self, fluid: Fluid, near: NearParticles, bodies: Bodies, force: ti.Ndarray) -> None:
         """Pull of the surface on each sample of a moving body [N], along the contact line."""
         gather_contact_pull(fluid, self._contact.pull, near, bodies, force)
-
-
-def smoothing_loss(support_in_spacings: float) -> float:
-    """Sum of the gradients over a lattice with a flat surface, over that of the smoothed ones [-]."""
-    offsets = lattice_offsets(support_in_spacings)
-    distances = np.linalg.norm(offsets, axis=1)
-    volume, count = particle_volume(1.0, support_in_spacings), math.ceil(support_in_spacings)
-    slopes = volume * evaluate_slope(distances, support_in_spacings) * offsets[:, 2] / np.maximum(distances, 1.0)
-    weights = volume * evaluate(distances, support_in_spacings)
-    # Of the layer n under the surface; those above it are missing.
-    gradient = np.array([slopes[offsets[:, 2] <= n].sum() for n in range(count)] + [0.0] * count)
-    smooth = [
-        sum(weights[offsets[:, 2] == m - n].sum() * gradient[m] for m in range(2 * count)) for n in range(2 * count)
-    ]
-    return float(gradient.sum() / sum(smooth))
 
 
 @kernel
@@ -365,7 +349,7 @@ def pulled_share(gradient: ti.f32) -> ti.f32:
 
 @kernel
 def compute_surface_force(
-    fluid: Fluid, interface: Interface, contact: Contact, curvature: Floats, gain: ti.f32, force: Vectors, share: Share
+    fluid: Fluid, interface: Interface, contact: Contact, curvature: Floats, force: Vectors, share: Share
 ):
     """a_i = -2 C sigma k_i |<grad c>| n_i/rho0; in the tree its sum [N], and those of surface mass and of walls."""
     particles, materials = ti.static((fluid.particles, fluid.materials))
@@ -382,7 +366,7 @@ def compute_surface_force(
                 pulled = pulled_share(interface.gradient[i])
                 if pulled > 0.0:
                     k_i = mean_curvature(fluid, interface, curvature, i)
-                    strength = 2.0 * gain * materials.surface_tension[own] / materials.rest_density[own]
+                    strength = 2.0 * GAIN * materials.surface_tension[own] / materials.rest_density[own]
                     a_i = -strength * k_i * pulled * fluid.inverse_support * interface.normal[i]
                 m_i = fluid.volume * materials.rest_density[own]
                 total += m_i * a_i
