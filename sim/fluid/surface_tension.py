@@ -39,12 +39,14 @@ from 60 to 90 degrees; at 120 it pulls 16 % too little."""
 
 BLEND_AT_WALL = 0.4  # share of the next layer's normal in that of the layer on a wall; the contact angle gives the rest
 STEEPENING = 1.1  # of an angle below 90 degrees, from there: smoothing draws normals on a wall towards those above
+LITTLE_BEYOND = 0.1  # weight of the next layer over that of its own, below which it has less share [-]
 SEEN_WALL = 0.02  # h |grad c| of a wall from which on a particle lies on it [-]
 LEAST_TANGENT = 0.2  # share of a gradient along a wall from which on it tells where the fluid ends [-]
 LEAST_GRADIENT = 0.15  # h |grad c|, smoothed, of particles that have a curvature [-]; 0.9 at a surface, 0.04 within
 NO_PULL, FULL_PULL = 0.05, 0.15  # the same, below which tension does not act, and from which on it acts in full [-]
 DEPTH_OF_LAYER = 0.5  # of the outer layer's particles under the surface [spacings]
 MOST_CURVATURE = 1.0  # that particles can tell [1/spacing]
+LEAST_AREA = 0.3  # of the surface over that of its outer layer, where it is a trough as narrow as particles [-]
 FADING = 0.05  # weight of no curvature in a mean: where no surface is near there is none [-]
 LEAST_SPREAD = 0.02  # of neighbours along the surface, so that two of them do not tell a curvature [spacings²]
 
@@ -108,7 +110,6 @@ class Interface(NamedTuple):
 
     normal: Vectors  # outward unit normal [-]
     gradient: Floats  # h |grad c|, smoothed, of the fluid's colour c, which is 1 in it and on walls [-]
-    curvature: Floats  # of the surface nearby, k = div n, 2/R for a drop [1/m]
 
 
 @bundle
@@ -150,11 +151,8 @@ class SurfaceTensionCSF:
         given = np.array([fluid.contact_angle_deg for fluid in fluids])
         angles = np.radians(np.where(given < 90.0, 90.0 + STEEPENING * (given - 90.0), given))
         self._gradient = ti.Vector.ndarray(3, ti.f32, capacity)
-        self._raw_curvature, self._mean_curvature = (ti.ndarray(ti.f32, capacity) for _ in range(2))
-        self.interface = Interface(
-            ti.Vector.ndarray(3, ti.f32, capacity),
-            *(ti.ndarray(ti.f32, capacity) for _ in range(2)),
-        )
+        self._curvature, self._mean_curvature = (ti.ndarray(ti.f32, capacity) for _ in range(2))
+        self._interface = Interface(ti.Vector.ndarray(3, ti.f32, capacity), ti.ndarray(ti.f32, capacity))
         self._contact = Contact(
             on_device(np.cos(angles)),
             on_device(np.sin(angles)),
@@ -165,7 +163,7 @@ class SurfaceTensionCSF:
 
     def add_acceleration(self, fluid: Fluid, acceleration: ti.Ndarray) -> None:
         """Add the accelerations by surface tension to all others [m/s²]."""
-        spacing, interface, curvature = self._discretization.spacing, self.interface, self._raw_curvature
+        spacing, interface, curvature = self._discretization.spacing, self._interface, self._curvature
         compute_gradients(fluid, self._contact, spacing, self._gradient)
         smooth_gradients(fluid, self._gradient, self._contact, interface)
         compute_curvatures(fluid, interface, spacing, curvature)
@@ -255,7 +253,7 @@ def smooth_gradients(fluid: Fluid, gradient: Vectors, contact: Contact, interfac
         total += wall_field / fluid.volume * gradient[i]
         size, size_beyond = total.norm(), beyond.norm()
         if size > 0.0 and size_beyond > 0.0:
-            blend = BLEND_AT_WALL * ti.min(10.0 * size_beyond / size, 1.0)
+            blend = BLEND_AT_WALL * ti.min(size_beyond / (LITTLE_BEYOND * size), 1.0)
             mixed = (1.0 - blend) / size * total + blend / size_beyond * beyond
             total = (size + size_beyond) * mixed.normalized(1.0e-9)
         size = total.norm()
@@ -305,7 +303,7 @@ def compute_curvatures(fluid: Fluid, interface: Interface, spacing: ti.f32, curv
             gauss = shape_uu * shape_vv - shape_uv * shape_vu
             gauss = ti.min(ti.max(gauss, -0.25 * most * most), 0.25 * trace * trace)
             # k1/(1 + t k1) + k2/(1 + t k2)
-            k_i = (trace + 2.0 * depth * gauss) / ti.max(1.0 + depth * trace + depth * depth * gauss, 0.3)
+            k_i = (trace + 2.0 * depth * gauss) / ti.max(1.0 + depth * trace + depth * depth * gauss, LEAST_AREA)
             k_i = ti.min(ti.max(k_i, -most), most)
         curvature[i] = k_i
 
@@ -362,7 +360,7 @@ def compute_surface_force(
             i = lane * share.lane_step + item * share.item_step
             if i < particles.count:
                 own = particles.phase[i]
-                k_i, a_i = 0.0, ti.math.vec3(0.0)
+                a_i = ti.math.vec3(0.0)
                 pulled = pulled_share(interface.gradient[i])
                 if pulled > 0.0:
                     k_i = mean_curvature(fluid, interface, curvature, i)
@@ -373,7 +371,6 @@ def compute_surface_force(
                 mass += m_i * pulled
                 on_wall += contact.on_wall[i]
                 force[i] = a_i
-                interface.curvature[i] = k_i
         for axis in ti.static(range(3)):
             share.tree.partial[axis * lanes + lane] = total[axis]
         share.tree.partial[3 * lanes + lane] = mass
