@@ -7,7 +7,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import brentq, curve_fit
 from scipy.spatial import ConvexHull
-from small_fluids import EVERY_FACE, lattice, make_fluid, run
+from small_fluids import EVERY_FACE, lattice, make_fluid, run, steps
+from thread_counts import digest_of, result_on_any_threads
 
 from sim.core.domain import DomainParameters
 from sim.fluid.boundary import at_origin
@@ -193,6 +194,19 @@ def test_threads_grow_fastest_at_the_wavelength_of_rayleigh_and_plateau(taichi_c
     # Rayleigh 1878: 9.02 radii, at 0.34 over the root of rho R³/sigma.
     assert -2.0 * curve[0] / curve[1] == pytest.approx(9.02, rel=0.15)
     assert max(rates) == pytest.approx(0.34, rel=0.25)
+
+
+def drop_on_a_plate(solver: str) -> str:
+    """Digest of all that a drop on a plate is after some steps."""
+    plate = DomainParameters(min=(-0.01, -0.01, 0.0), max=(0.01,) * 3, open_faces=("x-", "x+", "y-", "y+", "z+"))
+    fluid = csf_fluid(plate, lattice((-0.005, -0.004, 0.0), (0.005, 0.004, 0.006), SPACING), SPACING, solver=solver)
+    steps(fluid, 20)
+    return digest_of(fluid.checkpoint())
+
+
+@pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])
+def test_threads_do_not_change_a_bit(solver):
+    result_on_any_threads(drop_on_a_plate, solver)
 
 
 def test_a_body_gets_the_momentum_of_the_drop_that_it_carries(taichi_cpu):
