@@ -177,6 +177,15 @@ class SurfaceTensionCSF:
         gather_contact_pull(fluid, self._contact.pull, near, bodies, force)
 
 
+@func
+def is_alike(fluid: Fluid, own: ti.i32, j: ti.i32) -> ti.i32:
+    """Whether a particle is of a fluid; not looked up where there is one."""
+    alike = 1
+    if ti.static(fluid.materials.several):
+        alike = ti.cast(fluid.particles.phase[j] == own, ti.i32)
+    return alike
+
+
 @kernel
 def compute_gradients(fluid: Fluid, contact: Contact, spacing: ti.f32, gradient: Vectors):
     """-h grad c of each particle, turned to the contact angle on walls, and the pull of the surface on these.
@@ -191,7 +200,7 @@ def compute_gradients(fluid: Fluid, contact: Contact, spacing: ti.f32, gradient:
         first = near.start[i]
         for k in range(near.fluid_count[i]):
             j = near.indices[first + k * near.stride]
-            if particles.phase[j] == own:
+            if is_alike(fluid, own, j) != 0:
                 x_ij = x_i - particles.position[j]
                 r_squared = x_ij.norm_sqr()
                 inverse_r = inverse_distance(r_squared)
@@ -237,7 +246,7 @@ def smooth_gradients(fluid: Fluid, gradient: Vectors, contact: Contact, interfac
         first = near.start[i]
         for k in range(near.fluid_count[i]):
             j = near.indices[first + k * near.stride]
-            if particles.phase[j] == own:
+            if is_alike(fluid, own, j) != 0:
                 r_squared = (x_i - particles.position[j]).norm_sqr()
                 weight = spline(r_squared * inverse_distance(r_squared) * fluid.inverse_support)
                 if contact.on_wall[i] > contact.on_wall[j]:
@@ -282,7 +291,7 @@ def compute_curvatures(fluid: Fluid, interface: Interface, spacing: ti.f32, curv
             first = near.start[i]
             for k in range(near.fluid_count[i]):
                 j = near.indices[first + k * near.stride]
-                if particles.phase[j] == own:
+                if is_alike(fluid, own, j) != 0:
                     x_ji = particles.position[j] - x_i
                     r_squared = x_ji.norm_sqr()
                     weight = spline(r_squared * inverse_distance(r_squared) * fluid.inverse_support)
@@ -320,7 +329,7 @@ def mean_curvature(fluid: Fluid, interface: Interface, curvature: Floats, i: ti.
     first = near.start[i]
     for k in range(near.fluid_count[i]):
         j = near.indices[first + k * near.stride]
-        if particles.phase[j] == own and interface.gradient[j] > LEAST_GRADIENT:
+        if is_alike(fluid, own, j) != 0 and interface.gradient[j] > LEAST_GRADIENT:
             r_squared = (x_i - particles.position[j]).norm_sqr()
             weight = spline(r_squared * inverse_distance(r_squared) * fluid.inverse_support) * interface.gradient[j]
             total += weight * curvature[j]

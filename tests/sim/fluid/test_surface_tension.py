@@ -239,6 +239,35 @@ def test_a_body_gets_the_momentum_of_the_drop_that_it_carries(taichi_cpu):
     assert np.abs(impulse[0]).max() < 0.15 * line * 0.02
 
 
+def test_fluids_have_a_surface_each(taichi_cpu):
+    """Halves of a ball: one fluid has no surface between them, two have, and pull away from each other there."""
+    ball = lattice((-0.004,) * 3, (0.004,) * 3, SPACING)
+    ball = ball[np.linalg.norm(ball, axis=1) < 0.004]
+    block = [{"shape": {"type": "sphere", "radius": 1}}]
+    material = {**CSF, "solver": "wcsph", "particle_radius": SPACING / 2, "block": block, "artificial_viscosity": 0.0}
+    upper = (ball[:, 2] > 0.0).astype(np.int32)
+
+    def velocities(names: str, phase: np.ndarray | None) -> dict[str, np.ndarray]:
+        start = FluidStart(
+            tuple(FluidParameters.model_validate({**material, "name": name}) for name in names),
+            domain=SPACE,
+            gravity=(0.0, 0.0, 0.0),
+            positions=ball,
+            velocities=np.zeros_like(ball),
+            boundary=BoundarySamples.of_bodies(),
+            phase=phase,
+        )
+        fluid = SOLVERS["wcsph"](start)
+        fluid.substep(1.0e-6)
+        return {name: snapshot.arrays["velocity"] for name, snapshot in fluid.snapshots().items()}
+
+    one, two = velocities("a", None)["a"], velocities("ab", upper)
+    inside = np.linalg.norm(ball, axis=1) < 0.002
+    assert np.abs(one[inside]).max() < 0.02 * np.abs(one).max()
+    assert two["b"][inside[upper == 1], 2].mean() > 10.0 * abs(one[inside & (upper == 1), 2].mean())
+    np.testing.assert_allclose(two["a"][:, 2].sum(), -two["b"][:, 2].sum(), rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
