@@ -119,7 +119,7 @@ class Contact(NamedTuple):
     cosine: Floats
     sine: Floats
     on_wall: Floats  # 1 for particles of the layer on a wall, else 0
-    pull: Vectors  # of the surface on the wall over sum_b V_b W_ib [N m³]
+    pull: Vectors  # of the surface on the wall over sum_b V_b W_ib [N]
 
 
 class SurfaceTensionCSF:
@@ -137,7 +137,7 @@ class SurfaceTensionCSF:
     curvatures k1, k2 at a depth t those of the surface are k/(1 + t k). k_i is its mean over the neighbours, twice.
 
     In the layer on a wall the direction of g is n_w cos(theta) + t sin(theta), with the wall's normal n_w and t along
-    g's part along the wall (Brackbill et al., eq. 53). That is right at the wall; half a spacing above it the next
+    g's part along the wall (Brackbill et al.). That is right at the wall; half a spacing above it the next
     layer's normal counts as well. A body that moves gets sigma along the surface for each length of the contact line.
 
     Fluids have a surface each: two that touch have both tensions between them. The sum of k n over a closed surface
