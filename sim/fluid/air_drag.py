@@ -60,10 +60,7 @@ class AirDrag:
         radius = (3.0 / (4.0 * math.pi) * d.particle_volume) ** (1.0 / 3.0)
         # Where cohesion is no surface tension in N/m, drops flatten as those of water.
         tension = np.array(
-            [
-                each.surface_tension if each.surface_tension_model == "akinci2013" else TENSION_OF_WATER
-                for each in fluids
-            ]
+            [each.surface_tension if each.surface_tension_model == "csf" else TENSION_OF_WATER for each in fluids]
         )
         tension[tension == 0.0] = TENSION_OF_WATER
         self._air = Air(

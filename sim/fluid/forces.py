@@ -17,7 +17,7 @@ from sim.fluid.body_friction import BodyFriction
 from sim.fluid.kernels import inverse_distance, spline_slope
 from sim.fluid.particles import Fluid, Phases
 from sim.fluid.sheets import DENSITY
-from sim.fluid.surface_tension import Cohesion, SurfaceTensionAkinci2013, cohesion_becker_teschner2007
+from sim.fluid.surface_tension import Cohesion, SurfaceTensionCSF, cohesion_becker_teschner2007
 from sim.fluid.tank import ParticleTank
 from sim.fluid.viscosity import (
     CALM_SPEED,
@@ -47,11 +47,12 @@ class Forces:
     a_i = g - 1/rho0 [sum_j V (P_i + P_j) grad W_ij + sum_b V_b P_i grad W_ib] + viscosity + cohesion
 
     with P = p/(rho/rho0)², Monaghan's viscosity (`sim.fluid.viscosity`) and the cohesion of Becker & Teschner 2007, or
-    implicit viscosity (`sim.fluid.viscosity`) and the surface tension of Akinci et al. 2013 in their place.
+    implicit viscosity (`sim.fluid.viscosity`) and a continuum surface force in their place.
 
     Attributes:
         acceleration: of each particle [m/s²], (capacity,) of 3-vectors.
-        artificial_viscosity: alpha c h/2 at most [m²/s], which stands where 2 (d + 2) nu does.
+        artificial_viscosity: alpha c h/2 and what is added to it at most [m²/s], which stands where 2 (d + 2) nu does.
+        csf: surface tension by a continuum surface force; None without.
         implicit_viscosity: the solve for stiff fluids; None where viscosity is explicit.
         air: drag of the air; None without air.
     """
@@ -79,11 +80,13 @@ class Forces:
         fall_speed = math.sqrt(float(np.linalg.norm(tank.gravity)) * d.spacing)
         at_rest = CALMING * speed_ratio * fall_speed * smoothing_length
         calming = max(at_rest - artificial, 0.0) if artificial > 0.0 else 0.0
-        self.artificial_viscosity = artificial + calming
+        steady = LAPLACIAN_FACTOR * cohesion.viscosity if artificial > 0.0 else 0.0
+        self.artificial_viscosity = artificial + calming + steady
         self._viscosity = Viscosity(
             softening=SOFTENING * support**2,
             artificial=artificial,
             calming=calming,
+            steady=steady,
             calm_speed_squared=(CALM_SPEED * fall_speed) ** 2,
             wall_friction=wall_friction,
             with_wall_friction=wall_friction > 0.0,
@@ -98,10 +101,9 @@ class Forces:
             self.implicit_viscosity = ImplicitViscosity(capacity, bodies, wall_friction, d)
             nothing = on_device(np.zeros(len(phases)))
             self._explicit_materials = phases.materials._replace(dynamic_viscosity=nothing)
-        self._akinci2013: SurfaceTensionAkinci2013 | None = None
-        if cohesion.is_akinci2013:
-            attracting = tank.boundary.sheets.first
-            self._akinci2013 = SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, d, attracting)
+        self.csf: SurfaceTensionCSF | None = (
+            SurfaceTensionCSF(capacity, phases.parameters, d) if cohesion.is_csf else None
+        )
         self.air: AirDrag | None = AirDrag(phases.parameters, d) if parameters.air_density > 0.0 else None
         density = tank.particles.density
         self._no_pressure = Elastic(density, density, 0.0, False)
@@ -122,11 +124,10 @@ class Forces:
         tank, pressure, cohesion = self._tank, elastic or self._no_pressure, self._cohesion.is_becker_teschner2007
         spacing = tank.discretization.spacing
         compute_acceleration(self._fluid, pressure, self._viscosity, tank.gravity, spacing, cohesion, self.acceleration)
-        if (attraction := self._akinci2013) is not None:
-            attraction.add_acceleration(tank.on_device, self.acceleration)
-            if attraction.adheres:
-                fill = partial(attraction.fill_forces, tank.on_device)
-                tank.body_forces.gather_others(fill, tank.boundary.samples, dt)
+        if self.csf is not None:
+            self.csf.add_acceleration(tank.on_device, self.acceleration)
+            fill = partial(self.csf.fill_forces, tank.on_device)
+            tank.body_forces.gather_others(fill, tank.boundary.samples, dt)
         if self.air is not None:
             self.air.add_acceleration(tank.on_device, self.acceleration, dt)
         self._begin_reaction(None if elastic is None else elastic.pressure_term, dt)
@@ -173,7 +174,7 @@ class Forces:
         if solver is None:
             return
         fluid, body_forces = tank.on_device, tank.body_forces
-        viscosity = self._viscosity._replace(artificial=0.0, calming=0.0)
+        viscosity = self._viscosity._replace(artificial=0.0, calming=0.0, steady=0.0)
 
         def friction_at(velocity: ti.Ndarray, sample_velocity: ti.Ndarray) -> Exerted:
             particles = fluid.particles._replace(velocity=velocity)

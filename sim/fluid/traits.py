@@ -13,8 +13,7 @@ FORCE_NUMBER = 0.25  # fraction of sqrt(d / |a|) (Monaghan 1992, section 10.3)
 VISCOUS_NUMBER = 0.125  # fraction of d² / nu (Morris, Fox & Zhu 1997, eq. 20)
 PRESSURE_NUMBER = 1.0  # fraction of the inverse frequency against others' pressure; symplectic Euler is stable up to 2
 COHESION_NUMBER = 0.25  # fraction of the inverse frequency of a particle on the spring that its neighbours' cohesion is
-
-COHESION_PER_TENSION = 100.0  # cohesion c of Akinci et al. 2013 over sigma/(rho0 h²), by the swing of drops
+CAPILLARY_NUMBER = 0.5  # fraction of sqrt(rho d³/(2 pi sigma)) (Brackbill, Kothe & Zemach 1992, eq. 61)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +102,12 @@ def stable_time_step(
 def tension_step(fluid: "FluidParameters") -> float:
     """Largest step that the surface tension of a fluid allows [s]; infinite without any.
 
-    A particle swings on its neighbours' cohesion at a squared frequency of c/h (Akinci et al. 2013), or of kappa/d³ at
-    most (Becker & Teschner 2007). Both go as the capillary wave of a particle's length does, sigma/(rho d³).
+    With `csf` that of the shortest capillary waves, a fraction of sqrt(rho d³/(2 pi sigma)). With the cohesion of
+    Becker & Teschner 2007 a particle swings on its neighbours' at a squared frequency of kappa/d³ at most.
     """
     if fluid.surface_tension == 0.0:
         return math.inf
     rate = fluid.surface_tension / fluid.spacing**3
-    if fluid.surface_tension_model == "akinci2013":
-        rate *= COHESION_PER_TENSION / (fluid.rest_density * fluid.support_in_spacings**3)
+    if fluid.surface_tension_model == "csf":
+        return CAPILLARY_NUMBER / math.sqrt(2.0 * math.pi * rate / fluid.rest_density)
     return COHESION_NUMBER / math.sqrt(rate)

@@ -34,6 +34,7 @@ class Viscosity(NamedTuple):
     softening: ti.f32  # 0.01 h² [m²]
     artificial: ti.f32  # alpha c_s h/2 [m²/s]
     calming: ti.f32  # what pairs at rest have more of it [m²/s]
+    steady: ti.f32  # what fluid with surface tension has besides, where 2 (d + 2) nu stands [m²/s]
     calm_speed_squared: ti.f32  # square of the approach that halves this [m²/s²]
     wall_friction: ti.f32  # viscosity against boundaries over that of the fluid [-]
     with_wall_friction: ti.template()  # whether it is above 0
@@ -56,7 +57,9 @@ def viscous_factor(v_dot_x: ti.f32, r_squared: ti.f32, viscosity: Viscosity, mu:
     slow = viscosity.calm_speed_squared * r_squared
     share = slow / (slow + v_dot_x * v_dot_x + TINY_SQUARE)
     artificial = rho0 * (viscosity.artificial + viscosity.calming * share)
-    return (mu * v_dot_x + artificial * ti.min(v_dot_x, 0.0)) / (r_squared + viscosity.softening)
+    return ((mu + rho0 * viscosity.steady) * v_dot_x + artificial * ti.min(v_dot_x, 0.0)) / (
+        r_squared + viscosity.softening
+    )
 
 
 @func

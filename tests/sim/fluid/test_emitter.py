@@ -394,8 +394,8 @@ def test_the_samples_of_a_wall_in_a_mouth_weigh_nothing(taichi_cpu):
 @pytest.mark.parametrize("solver", ["wcsph", "dfsph"])
 @pytest.mark.parametrize(
     "tension",
-    [{"surface_tension": 0.01}, {"surface_tension": 0.072, "surface_tension_model": "akinci2013"}],
-    ids=["becker_teschner2007", "akinci2013"],
+    [{"surface_tension": 0.01}, {"surface_tension": 0.072, "surface_tension_model": "csf"}],
+    ids=["becker_teschner2007", "csf"],
 )
 def test_surface_tension_does_not_throw_a_jet_out(taichi_cpu, solver, tension):
     # As thick as a jet in a kitchen: pressure by cohesion would make 0.4 m/s of 0.3. It pulls back at the opening.

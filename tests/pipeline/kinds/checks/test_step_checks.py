@@ -120,19 +120,19 @@ def test_a_step_that_the_flow_does_not_bear_is_warned_of_once():
 
 def test_a_surface_that_is_stiffer_than_the_flow_is_told_with_what_the_flow_bears():
     def warnings(**water: object) -> list[str]:
-        fluid = {**WATER, "solver": "dfsph", "surface_tension_model": "akinci2013", **water}
+        fluid = {**WATER, "solver": "dfsph", "surface_tension_model": "csf", **water}
         job = Job.model_validate({"name": "a", "frames": 2, "fluid": [fluid]}, strict=False)
         return [each.message for each in check_job(job).warnings if each.path == ("fluid", 0, "surface_tension")]
 
     assert warnings(surface_tension=0.072) == []  # a frame's steps are those of the flow
     (stiff,) = warnings(surface_tension=1.0e5)
-    # 1/4 of the root of rho h³/(100 sigma), h = 0.08 m.
-    step = 0.25 * math.sqrt(1000.0 * 0.08**3 / (100.0 * 1.0e5))
+    # Half of the root of rho d³/(2 pi sigma), d = 0.04 m.
+    step = 0.5 * math.sqrt(1000.0 * 0.04**3 / (2.0 * math.pi * 1.0e5))
     assert float(stiff.partition("steps of ")[2].partition(" s")[0]) == pytest.approx(step, rel=ROUNDING)
     bearable = float(stiff.partition("use ")[2].partition(" or less")[0])
     assert warnings(surface_tension=bearable) == []
     assert warnings(surface_tension=1.3 * bearable)
-    fixed = stable_step(solver="dfsph", surface_tension_model="akinci2013", surface_tension=1.0e5)
+    fixed = stable_step(solver="dfsph", surface_tension_model="csf", surface_tension=1.0e5)
     assert fixed == pytest.approx(step, rel=ROUNDING)
 
 
