@@ -194,8 +194,6 @@ class SPHFluid(ABC):
         for number, fluid in enumerate(self.phases.parameters):
             own = {name: array[phase == number] for name, array in arrays.items()}
             own["density"] = own["density"] * np.float32(fluid.rest_density)
-            if not fluid.has_dye:
-                own.pop(DYE, None)
             attributes = {"particle_radius": fluid.particle_radius, "rest_density": fluid.rest_density}
             snapshots[fluid.name] = Snapshot(kind="fluid", arrays=own, attributes=attributes)
         return snapshots

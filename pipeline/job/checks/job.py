@@ -106,6 +106,7 @@ def _check_materials(job: Job, findings: Findings) -> None:
 def _check_dye(job: Job, findings: Findings) -> None:
     """Warn of dye that no picture shows, and of the colour of a dye that is not there."""
     dyed = {fluid.name for fluid in job.fluid if fluid.has_dye}
+    reached = {fluid.name for fluid in job.fluid} if dyed else set()  # it goes from one fluid of a tank into the others
     cloudy = [name for name, row in LOOK_TABLE.items() if "dye_color" in row.keys]
     for index, fluid in enumerate(job.fluid):
         material = described_material(job, fluid.name)
@@ -123,7 +124,7 @@ def _check_dye(job: Job, findings: Findings) -> None:
             )
     for written, said in job.material.items():
         meant = [body.name for _, _, body in bodies(job) if is_meant(written, body.name)]
-        if said.dye_color is not None and meant and not dyed & set(meant):
+        if said.dye_color is not None and meant and not reached & set(meant):
             findings.warn(
                 ("material", written, "dye_color"),
                 f'has no effect, as "{meant[0]}" has no dye; give a [[fluid.block]] or [[fluid.emitter]] of it a dye',
