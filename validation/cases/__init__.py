@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CASES = (
-    "kernel", "hydrostatic", "dam-break", "box-impact", "turned-jet", "elliptical-drop", "viscosity", "free-momentum",
-    "coupled-momentum", "rigid-motion", "rigid-contacts", "inertia", "cloth", "cloth-crossings", "smoke-vortices",
-    "smoke-projection", "smoke-plume", "smoke-front", "smoke-mass", "submerged-sphere", "buoyancy", "bunny-energy",
+    "kernel", "hydrostatic", "dam-break", "box-impact", "turned-jet", "rayleigh-taylor", "elliptical-drop", "viscosity",
+    "free-momentum", "coupled-momentum", "rigid-motion", "rigid-contacts", "inertia", "cloth", "cloth-crossings",
+    "smoke-vortices", "smoke-projection", "smoke-plume", "smoke-front", "smoke-mass", "submerged-sphere", "buoyancy",
+    "bunny-energy",
 )  # fmt: skip
 """In the order in which they are computed; each in the module of its name."""
 
