@@ -9,7 +9,7 @@ there is finer than the particles: a part of the size d rises by its buoyancy at
 with the larger rho and mu of the two: free fall, and Stokes' law. Who has neither risen nor sunk under a heavier
 neighbour for several d/u changes places with it. Both keep their velocities, so that momentum is kept to the bit; the
 energy set free is what the flow in between would lose. Whatever the particles can tell, such as a wave of Rayleigh and
-Taylor, moves, and is left to them (docs/decisions/0060-held-under-what-is-heavier.md).
+Taylor, moves, and is left to them (docs/decisions/0061-held-under-what-is-heavier.md).
 """
 
 from typing import NamedTuple

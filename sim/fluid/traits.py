@@ -14,10 +14,6 @@ VISCOUS_NUMBER = 0.125  # fraction of d² / nu (Morris, Fox & Zhu 1997, eq. 20)
 PRESSURE_NUMBER = 1.0  # fraction of the inverse frequency against others' pressure; symplectic Euler is stable up to 2
 COHESION_NUMBER = 0.25  # fraction of the inverse frequency of a particle on the spring that its neighbours' cohesion is
 
-KEPT_OFF_SHEETS = 0.403
-"""What fluid at rest keeps off a sheet, where it touches walls, over the support: `sim.fluid.sheets.kept_away` at
-a support of two spacings, for who does not load Taichi. Of wider supports it is up to a tenth more."""
-
 COHESION_PER_TENSION = 100.0  # cohesion c of Akinci et al. 2013 over sigma/(rho0 h²), by the swing of drops
 
 
@@ -73,6 +69,10 @@ TRAITS: Mapping[str, SolverTraits] = {
     ),
 }
 """Traits by the name of the solver; the solvers themselves are in `sim.fluid.solvers`."""
+
+KEPT_OFF_SHEETS = 0.403
+"""What fluid at rest keeps off a sheet, where it touches walls, over the support: `sim.fluid.sheets.kept_away` at
+a support of two spacings, for who does not load Taichi. Of wider supports it is up to a tenth more."""
 
 
 def stable_time_step(
