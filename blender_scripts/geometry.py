@@ -18,6 +18,7 @@ REST_UV = "rest"
 PICTURE_UV = "UVMap"  # UV map of coordinates on pictures, by Blender's usual name: the one that image textures follow
 WET = "wet"  # attribute that tells where a fluid touches solids: 1 there, 0 where its surface is free (`wetting`)
 DYE = "dye"  # attribute of a fluid's concentration of dye [-]
+DYE_BEHIND = "dye_behind"  # attribute of how deep dye lies behind its surface [m]
 COVERED = "covered"  # attribute of what light goes through: above 1/2 where a liquid covers it (`wetting`)
 COVER_INDEX = "cover_index"  # and that liquid's refractive index, less 1
 
@@ -77,7 +78,8 @@ def fill_mesh(mesh: Any, source: SurfaceMesh, wetness: np.ndarray | None = None)
         set_attribute(mesh, "velocity", source.velocities)
         set_attribute(mesh, "custom_normal", source.normals)
         set_attribute(mesh, WET, wetness)
-        set_attribute(mesh, DYE, None if source.dye is None else np.ascontiguousarray(source.dye[:, 0]))
+        for name, values in ((DYE, source.dye), (DYE_BEHIND, source.dye_behind)):
+            set_attribute(mesh, name, None if values is None else np.ascontiguousarray(values[:, 0]))
         _set_uv_map(mesh, REST_UV, None if source.uv is None else source.uv[source.faces])
         _set_uv_map(mesh, PICTURE_UV, source.corner_uv)
     mesh.update(calc_edges=True)

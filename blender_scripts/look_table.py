@@ -59,12 +59,12 @@ class LookRow:
 
 
 LOOK_TABLE: dict[str, LookRow] = {
-    "water": LookRow(SURFACES, ("roughness", "density", "caustics")),
-    "honey": LookRow(SURFACES, ("roughness", "density", "caustics"), revision=2),
-    "wine": LookRow(SURFACES, ("roughness", "density", "caustics")),
-    "oil": LookRow(SURFACES, ("roughness", "density", "caustics")),
-    "coffee": LookRow(SURFACES, ("roughness", "density", "caustics")),
-    "ink": LookRow(SURFACES, ("roughness", "density", "caustics")),
+    "water": LookRow(SURFACES, ("roughness", "density", "caustics", "dye_color")),
+    "honey": LookRow(SURFACES, ("roughness", "density", "caustics", "dye_color"), revision=2),
+    "wine": LookRow(SURFACES, ("roughness", "density", "caustics", "dye_color")),
+    "oil": LookRow(SURFACES, ("roughness", "density", "caustics", "dye_color")),
+    "coffee": LookRow(SURFACES, ("roughness", "density", "caustics", "dye_color")),
+    "ink": LookRow(SURFACES, ("roughness", "density", "caustics", "dye_color")),
     "milk": LookRow(SURFACES, ("roughness", "density", "dye_color")),
     "juice": LookRow(SURFACES, ("roughness", "density", "dye_color")),
     "muddy_water": LookRow(SURFACES, ("roughness", "density", "dye_color")),
@@ -77,7 +77,7 @@ LOOK_TABLE: dict[str, LookRow] = {
     "stone": LookRow(SURFACES, ("roughness",), swims_on=("fluid", "cloth"), fits_sheets=True, paves=True, revision=2),
     "wood": LookRow(SURFACES, ("roughness",), swims_on=("fluid",), fits_sheets=True, paves=True, revision=2),
     "glass": LookRow(SURFACES, ("roughness", "caustics"), revision=2),
-    "drops": LookRow(SURFACES, ("roughness",), lets_light_by=True, revision=3),
+    "drops": LookRow(SURFACES, ("roughness", "dye_color"), lets_light_by=True, revision=3),
     "spray": LookRow(SURFACES, ("roughness",)),
     "foam": LookRow(SURFACES),
     "bubbles": LookRow(SURFACES, ("roughness",)),

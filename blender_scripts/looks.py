@@ -12,8 +12,15 @@ from typing import Any
 import bpy
 
 from blender_scripts import smoke_looks, weaves, wood  # noqa: F401 - they register their looks
-from blender_scripts.geometry import COVER_INDEX, COVERED, DYE, WET
-from blender_scripts.optics import JUICE_REFLECTANCE, MUD_REFLECTANCE, REFRACTIVE_INDEX, per_metre
+from blender_scripts.geometry import COVER_INDEX, COVERED, DYE, DYE_BEHIND, WET
+from blender_scripts.optics import (
+    INSIDES,
+    JUICE_REFLECTANCE,
+    MUD_REFLECTANCE,
+    REFRACTIVE_INDEX,
+    dye_per_metre,
+    per_metre,
+)
 from blender_scripts.shading import LOOKS, Color, LookContext, NodeBuilder, draws, or_default
 
 HONEY_SCATTERING_PER_M = 40.0
@@ -27,6 +34,10 @@ MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
 MIST_GOES_FORWARD = 0.85
 """Share of the light through drops that are no points that keeps its direction [-]: the asymmetry of scattering by
 balls of water in geometric optics (Bohren & Huffman 1983). Scattered evenly, the rest carries as much light aside."""
+
+WHITE: Color = (1.0, 1.0, 1.0)
+MIST: Color = (0.97, 0.985, 1.0)
+"""Light that leaves a drop of water, and what drops that are no points scatter."""
 
 SMALLEST_DROP = 1.0
 """Radius of drops at least [pixels]; fewer of these stand for smaller ones."""
@@ -59,15 +70,33 @@ draws("ink")(partial(_clear, look="ink", tint=(0.96, 0.96, 0.96)))
 def _clear_surface(
     builder: NodeBuilder, context: LookContext, *, look: str, tint: Color, color: Color = (1.0, 1.0, 1.0)
 ) -> None:
-    """The surface of what is clear, which lets light through to what lies under it in a tint."""
+    """The surface of what is clear, which lets light through to what lies under it in a tint.
+
+    Dye is seen through it: light loses half of what all the dye behind takes where it enters, half where it leaves.
+    """
+    entering: Any = (1.0, 1.0, 1.0)
+    color_of_base: Any = color
+    if context.dye_color is not None and look in INSIDES:
+        entering = _through_dye(builder, dye_per_metre(look, context.inner_density, context.color, context.dye_color))
+        # The shader takes the root of it for what enters, and for what leaves.
+        color_of_base = builder.vector_math("MULTIPLY", builder.vector_math("MULTIPLY", entering, entering), color)
+        tint = builder.vector_math("MULTIPLY", entering, tint)
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
-        Base_Color=color,
+        Base_Color=color_of_base,
         Roughness=or_default(context.roughness, 0.0),
         IOR=_relative_index(builder, context, REFRACTIVE_INDEX[look]),
         Transmission_Weight=1.0,
     )
-    builder.surface(_refracting(builder, context, shader, tint=tint))
+    builder.surface(_refracting(builder, context, shader, tint=tint, straight_tint=entering))
+
+
+def _through_dye(builder: NodeBuilder, taken: Color) -> Any:
+    """The output socket of what is left of light after half of the dye behind a surface, which takes so much [1/m]."""
+    behind = builder.node("ShaderNodeAttribute")
+    behind.attribute_name = DYE_BEHIND
+    depths = (builder.math("MULTIPLY", behind.outputs[2], -0.5 * each) for each in taken)
+    return builder.combined(*(builder.math("EXPONENT", each) for each in depths))
 
 
 def _relative_index(builder: NodeBuilder, context: LookContext, own: float) -> Any:
@@ -98,13 +127,18 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
     builder.volume(both)
 
 
+def _with_dye(builder: NodeBuilder, context: LookContext, color: Color) -> Any:
+    """A colour, or the output socket of what dye makes of it."""
+    if context.dye_color is None:
+        return color
+    dye = builder.node("ShaderNodeAttribute")
+    dye.attribute_name = DYE
+    return builder.mix_colors(dye.outputs[2], color, context.dye_color)
+
+
 def _cloudy(builder: NodeBuilder, context: LookContext, *, look: str, reflectance: Color) -> None:
     """A liquid that light enters and leaves elsewhere, red the farthest, under a wet surface; dye tints it."""
-    color = or_default(context.color, reflectance)
-    if context.dye_color is not None:
-        dye = builder.node("ShaderNodeAttribute")
-        dye.attribute_name = DYE
-        color = builder.mix_colors(dye.outputs[2], color, context.dye_color)
+    color = _with_dye(builder, context, or_default(context.color, reflectance))
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
         Base_Color=color,
@@ -179,16 +213,16 @@ def _drops(builder: NodeBuilder, context: LookContext) -> None:
     Points are hit on their front only, so what enters leaves there, in the direction that both refractions give it.
     That is one refraction with an index of its own for each angle. A path goes straight through drops once
     `BENT_BY_DROPS` of them, or as many other surfaces, have bent it: in dense spray it would end in one, black. A
-    colour is that of the liquid through a drop, whichever way light leaves it.
+    colour is that of the liquid through a drop, whichever way light leaves it; dye goes from it to its own.
     """
-    color = or_default(context.color, (1.0, 1.0, 1.0))
+    color, scattered_color = (_with_dye(builder, context, or_default(context.color, each)) for each in (WHITE, MIST))
     index = REFRACTIVE_INDEX["water"]
     lens = builder.node("ShaderNodeBsdfRefraction", Color=color, Roughness=0.0, IOR=_index_of_ball(builder, index))
     through = builder.node("ShaderNodeBsdfTransparent", Color=color)
     path = builder.node("ShaderNodeLightPath").outputs
     bent = builder.math("GREATER_THAN", path["Transmission Depth"], BENT_BY_DROPS - 0.5)
     drop = builder.mix_shaders(bent, lens, through)
-    scattered = _scattering(builder, or_default(context.color, (0.97, 0.985, 1.0)))
+    scattered = _scattering(builder, scattered_color)
     mist = builder.mix_shaders(MIST_GOES_FORWARD, scattered, through)
     is_point = builder.math("GREATER_THAN", builder.node("ShaderNodePointInfo").outputs["Radius"], 0.0)
     inner = builder.mix_shaders(is_point, mist, drop)
@@ -274,7 +308,9 @@ def _scattering(builder: NodeBuilder, color: Color) -> Any:
     return builder.mix_shaders(0.5, back, builder.node("ShaderNodeBsdfTranslucent", Color=color))
 
 
-def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint: Color) -> Any:
+def _refracting(
+    builder: NodeBuilder, context: LookContext, shader: Any, *, tint: Any, straight_tint: Any = (1.0, 1.0, 1.0)
+) -> Any:
     """The shader of a clear body: shadow rays pass straight, and all light does where a fluid wets a solid.
 
     Without caustics, refractive things cast black shadows: no light sampled from behind them arrives. Rays that ask
@@ -292,7 +328,7 @@ def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint
     straight = _wetness(builder)
     if context.caustics:
         straight = builder.math("MULTIPLY", straight, builder.math("SUBTRACT", 1.0, for_light))
-    return builder.mix_shaders(straight, shader, builder.node("ShaderNodeBsdfTransparent"))
+    return builder.mix_shaders(straight, shader, builder.node("ShaderNodeBsdfTransparent", Color=straight_tint))
 
 
 def _wetness(builder: NodeBuilder) -> Any:

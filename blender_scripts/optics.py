@@ -140,13 +140,25 @@ def per_metre(look: str, density: float, color: Color | None = None) -> Color:
     return density * red, density * green, density * blue
 
 
-def through_ball(look: str, diameter: float, density: float, color: Color | None = None) -> Color:
-    """What white light becomes through a ball of a look [-], of a diameter [m], along straight rays.
+def dye_per_metre(look: str, density: float, color: Color | None, dye_color: Color) -> Color:
+    """What dye of concentration 1 takes from light beside the look itself, for red, green and blue [1/m].
+
+    With it the look has the colour `dye_color` as it would have that of a job. A dye takes light away, and brings none.
+    """
+    inside = INSIDES[look]
+    own_size = inside.true_size if color is None else inside.tinted_size
+    dyed = per_metre(look, density * inside.tinted_size / own_size, dye_color)
+    red, green, blue = (max(0.0, d - c) for d, c in zip(dyed, per_metre(look, density, color), strict=True))
+    return red, green, blue
+
+
+def through_ball(absorption: Color, diameter: float) -> Color:
+    """What white light becomes through a ball that absorbs [1/m], of a diameter [m], along straight rays [-].
 
     The mean of exp(-absorption chord) over its disc is 2 (1 - (1 + x) exp(-x)) / x², where x is absorption times
     diameter (van de Hulst 1957, "Light Scattering by Small Particles", 11.23).
     """
-    depths = (max(_THINNEST, each * diameter) for each in per_metre(look, density, color))
+    depths = (max(_THINNEST, each * diameter) for each in absorption)
     red, green, blue = (float(f"{2.0 * (-math.expm1(-x) - x * math.exp(-x)) / (x * x):.{_DIGITS}g}") for x in depths)
     return red, green, blue
 

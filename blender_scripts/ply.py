@@ -27,6 +27,7 @@ GROUPS = {
     "uv": ("s", "t"),
     "wet": ("wet",),
     "dye": ("dye",),
+    "dye_behind": ("dye_behind",),
 }
 """Columns of vertices by the names of their arrays, in the order that files have them."""
 _LONGEST_HEADER = 4096
@@ -36,15 +37,18 @@ FADE_S = 0.25
 """Over the end of its life a particle shrinks to nothing, instead of vanishing from one frame to the next [s]."""
 KINDS = ("spray", "foam", "bubbles")  # names of the values of `kind` of whitewater, from 0
 POINT = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz", "radius", "lifetime")), ("kind", "u1")])
+DYED_POINT = np.dtype([*POINT.descr, ("dye", "<f4")])  # of a drop of a fluid with dye
 _COMMENT = "comment not_made {not_made}\n"
-POINTS_HEADER = (
+_DYE_LINE = "property float dye\n"
+_POINTS_HEADER = (
     f"ply\nformat binary_little_endian 1.0\n{_COMMENT}element vertex {{count}}\n"
     + "".join(f"property {'uchar' if POINT[name].kind == 'u' else 'float'} {name}\n" for name in POINT.names or ())
-    + "end_header\n"
+    + f"{_DYE_LINE}end_header\n"
 )
 _POINTS_PATTERN = re.compile(
-    re.escape(POINTS_HEADER)
+    re.escape(_POINTS_HEADER)
     .replace(re.escape(_COMMENT), f"(?:{re.escape(_COMMENT)})?")  # files of earlier versions lack it
+    .replace(re.escape(_DYE_LINE), f"(?P<dye>{re.escape(_DYE_LINE)})?")
     .replace(re.escape("{count}"), r"(?P<count>0|[1-9]\d{0,9})")
     .replace(re.escape("{not_made}"), r"(?P<not_made>0|[1-9]\d{0,18})")
     .encode("ascii")
@@ -63,6 +67,7 @@ class SurfaceMesh:
         uv: (n, 2) float32 coordinates on the surface at rest [m], or None.
         wet: (n, 1) float32, how far a fluid's vertices touch solids: 1 where they do, 0 where they are free; or None.
         dye: (n, 1) float32 concentration of a fluid's dye [-], or None.
+        dye_behind: (n, 1) float32 depth of dye of concentration 1 that lies behind, along the normal [m], or None.
         corner_uv: (m, 3, 2) float32 coordinates on pictures, of the corners of faces, or None.
     """
 
@@ -73,6 +78,7 @@ class SurfaceMesh:
     uv: NDArray[np.float32] | None = None
     wet: NDArray[np.float32] | None = None
     dye: NDArray[np.float32] | None = None
+    dye_behind: NDArray[np.float32] | None = None
     corner_uv: NDArray[np.float32] | None = None
 
 
@@ -167,8 +173,14 @@ def require_sound_mesh(mesh: SurfaceMesh) -> None:
         raise ValueError(f"a face names vertex {bad}, but there are {len(mesh.vertices)}")
 
 
+def written_header(record: np.dtype[np.void], *, count: int, not_made: int) -> bytes:
+    """The header of so many points of `POINT` or `DYED_POINT`, with how many had no room."""
+    header = _POINTS_HEADER if record == DYED_POINT else _POINTS_HEADER.replace(_DYE_LINE, "")
+    return header.format(count=count, not_made=not_made).encode("ascii")
+
+
 def points_header(content: bytes) -> re.Match[bytes]:
-    """Match of the header of whitewater with `count` and, but in files of earlier versions, `not_made`.
+    """Match of the header of points with `count`, `dye` if they have some, and, but in earlier versions, `not_made`.
 
     Raises:
         ValueError: it is not of this layout.
@@ -180,15 +192,15 @@ def points_header(content: bytes) -> re.Match[bytes]:
 
 
 def read_points(content: bytes) -> NDArray[np.void]:
-    """Rows of `POINT` in a file's content.
+    """Rows of `POINT`, or of `DYED_POINT`, in a file's content.
 
     Raises:
         ValueError: it is not of this layout, or its size is not the one that its header promises.
     """
     header = points_header(content)
-    count = int(header["count"])
-    _require_size(content, header.end() + count * POINT.itemsize)
-    return np.frombuffer(content, POINT, count, header.end())
+    count, record = int(header["count"]), POINT if header["dye"] is None else DYED_POINT
+    _require_size(content, header.end() + count * record.itemsize)
+    return np.frombuffer(content, record, count, header.end())
 
 
 def drawn_radii(radius: NDArray[np.float32], lifetime: NDArray[np.float32]) -> NDArray[np.float32]:

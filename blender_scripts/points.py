@@ -11,19 +11,23 @@ import numpy as np
 
 from blender_scripts.documents import content_of
 from blender_scripts.errors import RenderInputError
-from blender_scripts.geometry import new_object, set_attribute
-from blender_scripts.ply import KINDS, POINT, drawn_radii
+from blender_scripts.geometry import DYE, new_object, set_attribute
+from blender_scripts.ply import DYED_POINT, KINDS, drawn_radii
 from blender_scripts.ply import read_points as read_rows
 from blender_scripts.shading import NodeBuilder
 
 
 @dataclass(frozen=True)
 class Points:
-    """Spheres in world space: positions [m] (n, 3), velocities [m/s] (n, 3) and radii [m] (n,), float32."""
+    """Spheres in world space: positions [m] (n, 3), velocities [m/s] (n, 3) and radii [m] (n,), float32.
+
+    Drops of a fluid with dye have its concentration [-], (n,), float32; else it is None.
+    """
 
     positions: np.ndarray
     velocities: np.ndarray
     radii: np.ndarray
+    dye: np.ndarray | None
 
 
 def read_points(path: Path, kind: str) -> Points:
@@ -36,7 +40,7 @@ def read_points(path: Path, kind: str) -> Points:
         rows = read_rows(content_of(path, "points"))
     except ValueError as error:
         raise RenderInputError(f"the points {path}: {error}") from error
-    bad = sum(int(np.count_nonzero(~np.isfinite(rows[name]))) for name in POINT.names or ())
+    bad = sum(int(np.count_nonzero(~np.isfinite(rows[name]))) for name in rows.dtype.names or ())
     if bad:
         raise RenderInputError(f"the points {path} have {bad} values that are not finite")
     chosen = rows[rows["kind"] == KINDS.index(kind)]
@@ -44,6 +48,7 @@ def read_points(path: Path, kind: str) -> Points:
         positions=np.stack([chosen[name] for name in ("x", "y", "z")], axis=1).astype(np.float32),
         velocities=np.stack([chosen[name] for name in ("vx", "vy", "vz")], axis=1).astype(np.float32),
         radii=drawn_radii(chosen["radius"], chosen["lifetime"]),
+        dye=np.ascontiguousarray(chosen["dye"], np.float32) if chosen.dtype == DYED_POINT else None,
     )
 
 
@@ -78,6 +83,7 @@ def fill_points(mesh: Any, points: Points) -> None:
         mesh.attributes["position"].data.foreach_set("vector", points.positions.ravel())
     set_attribute(mesh, "velocity", None if is_empty else points.velocities)
     set_attribute(mesh, "radius", None if is_empty else points.radii)
+    set_attribute(mesh, DYE, None if is_empty else points.dye)
     mesh.update()
 
 

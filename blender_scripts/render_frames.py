@@ -267,7 +267,12 @@ class SceneRenderer:
             ]
             touchables = [*solids, *others]
             mesh, wetness = wetting.wetted(
-                surface, reach=reach, floor_z=self._floor_z, touchables=touchables, dips=dips
+                surface,
+                reach=reach,
+                floor_z=self._floor_z,
+                touchables=touchables,
+                dips=dips,
+                off_sheets=description.get("off_cloth") or 0.0,
             )
             yield description, blender_object, mesh, wetness
 

@@ -1,6 +1,8 @@
-"""Dye of a fluid on its surface: the mean of the particles around each vertex, weighed by the kernel."""
+"""Dye of a fluid as its surface shows it: the mean of the particles around each vertex, and the dye behind it."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,6 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 SUPPORT_IN_RADII = 4.0
 """Width of the kernel, as in the simulation: a vertex has half of its neighbours there, a dozen."""
 _NEIGHBOURS = 24
+
+_MOST_CELLS = 2**25
+"""Of the grid that dye is looked up in; a frame that needs more has wider ones than a spacing."""
+_STEP_IN_CELLS = 0.5
+_LEAST_FILLED = 0.3  # of a cell, of what is liquid; behind what is not the dye is another surface's
+_SKIN_IN_CELLS = 1.5  # so deep below the surface cells are only partly filled
 
 
 def dye_at(vertices: ArrayLike, positions: ArrayLike, dye: ArrayLike, *, particle_radius: float) -> NDArray[np.float32]:
@@ -35,3 +43,71 @@ def dye_at(vertices: ArrayLike, positions: ArrayLike, dye: ArrayLike, *, particl
     mean = (weights * concentrations[nearest]).sum(axis=1) / weights.sum(axis=1)
     found: NDArray[np.float32] = mean[:, None].astype(np.float32)
     return found
+
+
+def dye_behind(
+    vertices: ArrayLike, normals: ArrayLike, positions: ArrayLike, dye: ArrayLike, *, particle_radius: float
+) -> NDArray[np.float32]:
+    """Depth of dye of concentration 1 behind vertices [m], (n, 1): the integral of c along the normal, inwards.
+
+    It ends where the liquid does. What light loses on its way through follows from it by the law of Beer and Lambert.
+
+    Args:
+        vertices: (n, 3) [m].
+        normals: unit vectors that point out of the liquid, (n, 3).
+        positions: of the particles [m], (m, 3).
+        dye: their concentrations [-], (m,).
+        particle_radius: [m], half the spacing of the particles at rest.
+    """
+    from scipy.ndimage import map_coordinates
+
+    places, inwards = np.asarray(vertices, np.float64), -np.asarray(normals, np.float64)
+    depth = np.zeros(len(places))
+    if len(places) == 0 or not np.any(dye):
+        return depth[:, None].astype(np.float32)
+    grid = _Grid.of(np.asarray(positions, np.float64), np.asarray(dye, np.float64), 2.0 * particle_radius)
+    step, skin = _STEP_IN_CELLS * grid.cell, _SKIN_IN_CELLS * grid.cell
+    alive, way = np.arange(len(places)), 0.5 * step
+    # No straight way through the grid is longer than its diagonal.
+    while len(alive) and way < grid.diagonal:
+        at = ((places[alive] + way * inwards[alive] - grid.origin) / grid.cell).T
+        filled, dyed = (map_coordinates(each, at, order=1, prefilter=False) for each in (grid.filled, grid.dyed))
+        is_inside = (filled >= _LEAST_FILLED) | (way < skin)
+        depth[alive] += step * dyed * is_inside
+        alive, way = alive[is_inside], way + step
+    return depth[:, None].astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Particles on a grid, each shared out among the eight points around it."""
+
+    origin: NDArray[np.float64]
+    cell: float
+    filled: NDArray[np.float32]  # share of a cell that is liquid [-]
+    dyed: NDArray[np.float32]  # the same times its concentration of dye [-]
+
+    @classmethod
+    def of(cls, positions: NDArray[np.float64], dye: NDArray[np.float64], spacing: float) -> _Grid:
+        """The grid of particles of a spacing [m], with an empty point around it."""
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        cell = max(spacing, float(np.prod(high - low + 4.0 * spacing) / _MOST_CELLS) ** (1.0 / 3.0))
+        origin = low - 2.0 * cell
+        counts = np.ceil((high - origin) / cell).astype(int) + 3
+        at = (positions - origin) / cell
+        base = np.floor(at).astype(int)
+        beyond = at - base
+        filled, dyed = (np.zeros(int(counts.prod())) for _ in range(2))
+        volume = (spacing / cell) ** 3
+        for corner in np.ndindex(2, 2, 2):
+            weight = volume * np.prod(np.where(corner, beyond, 1.0 - beyond), axis=1)
+            index = np.ravel_multi_index(tuple((base + corner).T), tuple(counts))
+            filled += np.bincount(index, weight, len(filled))
+            dyed += np.bincount(index, weight * dye, len(dyed))
+        shaped = (each.reshape(counts).astype(np.float32) for each in (filled, dyed))
+        return cls(origin, cell, *shaped)
+
+    @property
+    def diagonal(self) -> float:
+        """From one corner to the opposite one [m]."""
+        return float(self.cell * np.linalg.norm(self.filled.shape))

@@ -25,6 +25,7 @@ def write_ply(
     velocities: ArrayLike | None = None,
     uv: ArrayLike | None = None,
     dye: ArrayLike | None = None,
+    dye_behind: ArrayLike | None = None,
     corner_uv: ArrayLike | None = None,
 ) -> None:
     """Write a triangle mesh; the same arrays give the same bytes. They are those of `SurfaceMesh`, of any type.
@@ -32,7 +33,8 @@ def write_ply(
     Raises:
         ValueError: the shapes do not fit together.
     """
-    groups = {"vertices": vertices, "normals": normals, "velocities": velocities, "uv": uv, "dye": dye}
+    groups = {"vertices": vertices, "normals": normals, "velocities": velocities, "uv": uv}
+    groups |= {"dye": dye, "dye_behind": dye_behind}
     columns: dict[str, Any] = {
         name: _as_rows(name, value, len(GROUPS[name])) for name, value in groups.items() if value is not None
     }

@@ -307,8 +307,9 @@ class MaterialParameters(Parameters):
 
     dye_color: Color | None = Field(
         default=None,
-        description="Milk, juice and muddy water: colour of a fluid whose dye has the concentration 1, linear RGB; it "
-        "mixes evenly with color, that of the concentration 0.",
+        description="Liquids: colour of a fluid whose dye has the concentration 1, linear RGB, beside color, that of "
+        "the concentration 0. In milk, juice and muddy water they mix evenly on the surface; in clear ones dye takes "
+        "light away by how much of it lies behind.",
     )
 
     @field_validator("blend")

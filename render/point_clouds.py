@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from blender_scripts.ply import KINDS, POINT, POINTS_HEADER, drawn_radii, points_header, read_points
+from blender_scripts.ply import DYED_POINT, KINDS, POINT, drawn_radii, points_header, read_points, written_header
 from render.errors import InvalidFileError, invalid_if_refused
 
 __all__ = [
@@ -21,7 +21,7 @@ __all__ = [
     "write_point_cloud",
 ]
 
-_LONGEST_HEADER = len(POINTS_HEADER) + 32
+_LONGEST_HEADER = len(written_header(DYED_POINT, count=0, not_made=0)) + 32
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class PointCloud:
         lifetime: what is left of it [s], (n,), float32; drops do not fade.
         kind: index into `KINDS`, (n,), uint8.
         not_made: particles that the frame should have got, and had no room for.
+        dye: concentration [-], (n,), float32, of drops of a fluid with dye; else None.
     """
 
     position: NDArray[np.float32]
@@ -43,6 +44,7 @@ class PointCloud:
     lifetime: NDArray[np.float32]
     kind: NDArray[np.uint8]
     not_made: int = 0
+    dye: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -60,16 +62,19 @@ def write_point_cloud(path: Path, cloud: PointCloud) -> None:
         ValueError: the shapes do not fit together.
     """
     count = len(cloud.position)
-    shapes = {name: getattr(cloud, name).shape for name in ("position", "velocity", "radius", "lifetime", "kind")}
+    names = ("position", "velocity", "radius", "lifetime", "kind", *(() if cloud.dye is None else ("dye",)))
+    shapes = {name: getattr(cloud, name).shape for name in names}
     expected = {"position": (count, 3), "velocity": (count, 3)}
     if any(shape != expected.get(name, (count,)) for name, shape in shapes.items()):
         raise ValueError(f"a cloud needs a row of each for every point, got {shapes}")
-    rows = np.empty(count, POINT)
+    rows = np.empty(count, POINT if cloud.dye is None else DYED_POINT)
     for axis, name in enumerate("xyz"):
         rows[name], rows[f"v{name}"] = cloud.position[:, axis], cloud.velocity[:, axis]
     rows["radius"], rows["lifetime"], rows["kind"] = cloud.radius, cloud.lifetime, cloud.kind
+    if cloud.dye is not None:
+        rows["dye"] = cloud.dye
     with path.open("wb") as file:
-        file.write(POINTS_HEADER.format(count=count, not_made=cloud.not_made).encode("ascii"))
+        file.write(written_header(rows.dtype, count=count, not_made=cloud.not_made))
         file.write(rows.tobytes())
 
 
@@ -94,6 +99,7 @@ def read_point_cloud(path: Path) -> PointCloud:
         lifetime=rows["lifetime"].astype(np.float32),
         kind=rows["kind"].copy(),
         not_made=int(header["not_made"]),
+        dye=rows["dye"].astype(np.float32) if rows.dtype == DYED_POINT else None,
     )
 
 
@@ -118,9 +124,9 @@ def validate_point_cloud(path: Path) -> None:
         OSError: it cannot be read.
     """
     cloud = read_point_cloud(path)
-    for name in ("position", "velocity", "radius", "lifetime"):
+    for name in ("position", "velocity", "radius", "lifetime", "dye"):
         values = getattr(cloud, name)
-        if not np.isfinite(values).all():
+        if values is not None and not np.isfinite(values).all():
             row = int(np.argwhere(~np.isfinite(values))[0][0])
             raise InvalidFileError(path, f"{name} of point {row} is not finite: {values[row].tolist()}")
     if (cloud.radius <= 0.0).any():

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
-from sim.fluid.parameters import FluidParameters
+from sim.fluid.parameters import FluidParameters, dye_conflict
 from sim.rigid.parameters import RigidBodyParameters
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 
@@ -35,6 +35,13 @@ class SceneParameters(Parameters):
     @classmethod
     def _has_composed_names(cls, document: Any) -> Any:
         return composed(document)
+
+    @model_validator(mode="after")
+    def _has_dye_that_mixes(self) -> Self:
+        if conflict := dye_conflict(self.fluid):
+            number, reason = conflict
+            raise KeyRefusedError(("fluid", number), reason)
+        return self
 
     @model_validator(mode="after")
     def _has_one_air(self) -> Self:

@@ -109,11 +109,13 @@ def make_fluid(
     velocities: NDArray[np.floating] | None = None,
     gravity: tuple[float, float, float] = EARTH,
     coupled: Mapping[str, Any] | None = None,
+    fluids: Sequence[Mapping[str, Any]] = ({},),
     **parameters: Any,
 ) -> SPHFluid:
     """A fluid of given particles between the walls of a domain, at rest without velocities.
 
-    `coupled` are fields of `FluidStart` on bodies that move, `parameters` those of a material other than water.
+    `coupled` are further fields of `FluidStart`, `parameters` those of a material other than water, and `fluids` what
+    each of several has of its own.
     """
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
     from sim.fluid.parameters import FluidParameters
@@ -123,7 +125,7 @@ def make_fluid(
     block = {"shape": {"type": "box", "size": (1.0, 1.0, 1.0)}}
     usual = {"name": "water", "solver": solver, "block": [block], "particle_radius": spacing / 2.0}
     start = FluidStart(
-        (FluidParameters.model_validate({**usual, **parameters}),),
+        tuple(FluidParameters.model_validate({**usual, **parameters, **each}) for each in fluids),
         domain=domain,
         gravity=gravity,
         positions=positions,

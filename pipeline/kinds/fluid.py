@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blender_scripts.look_table import LOOK_TABLE
-from blender_scripts.optics import INSIDES, through_ball
+from blender_scripts.optics import INSIDES, dye_per_metre, per_metre, through_ball
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
@@ -22,7 +22,7 @@ from pipeline.model.looks import BODY, POINTS, WHITEWATER
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_particles
-from render.dye import dye_at
+from render.dye import dye_at, dye_behind
 from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
@@ -34,6 +34,8 @@ from sim.whitewater.kinds import LiquidKind, mean_diameter
 
 if TYPE_CHECKING:
     import h5py
+    import numpy as np
+    from numpy.typing import NDArray
 
 WETS_WITHIN_RADII = 1.5
 """How near a fluid's surface is to what it touches, in radii of its particles: up to 0.8 above moving ones."""
@@ -81,6 +83,7 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
         file=SURFACE.file_of(fluid.name),
         material=material,
         wets_within=WETS_WITHIN_RADII * fluid.particle_radius if sees else None,
+        off_cloth=fluid.kept_off_sheets if job.cloth else None,
     )
     yield PointSequenceObject(
         name=f"{fluid.name}.drops",
@@ -104,14 +107,20 @@ def _colored(
     absorbs = liquid.look in INSIDES and LOOK_TABLE[liquid.look].refracts
     if drops.look != "drops" or drops.color is not None or not absorbs:
         return drops
+    look, dye_color = liquid.look, liquid.dye_color
+    assert look is not None and liquid.density is not None, "materials are as dense as they are drawn"
     diameter = mean_diameter(
         particle_radius=fluid.particle_radius,
         diameter=job.surface.drop_diameter,
         most=job.surface.drops_per_particle,
     )
-    assert liquid.look is not None and liquid.density is not None, "materials are as dense as they are drawn"
-    color = through_ball(liquid.look, diameter, liquid.density, liquid.color)
-    return drops.model_copy(update={"color": color})
+    own = per_metre(look, liquid.density, liquid.color)
+    colors = {"color": through_ball(own, diameter)}
+    if dye_color is not None:
+        dye = dye_per_metre(look, liquid.density, liquid.color, dye_color)
+        red, green, blue = (of_look + of_dye for of_look, of_dye in zip(own, dye, strict=True))
+        colors["dye_color"] = through_ball((red, green, blue), diameter)
+    return drops.model_copy(update=colors)
 
 
 def _in_glass(job: Job) -> bool:
@@ -157,10 +166,13 @@ def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
         volume=len(meshed) * (2.0 * radius) ** 3 - fluid.number("volume_of_drops"),
         threads=threads,
     )
-    dye = fluid.arrays.get("dye")
-    if dye is not None:
-        dye = dye_at(surface.vertices, fluid.arrays["position"][meshed], dye[meshed], particle_radius=radius)
-    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities, dye=dye)
+    dyed: dict[str, NDArray[np.float32]] = {}
+    if (dye := fluid.arrays.get("dye")) is not None:
+        assert surface.normals is not None
+        particles, all_dye = fluid.arrays["position"][meshed], dye[meshed]
+        behind = dye_behind(surface.vertices, surface.normals, particles, all_dye, particle_radius=radius)
+        dyed = {"dye": dye_at(surface.vertices, particles, all_dye, particle_radius=radius), "dye_behind": behind}
+    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities, **dyed)
 
 
 def _facts(fluid: FluidParameters, count: float | None) -> str:
@@ -171,7 +183,7 @@ def _facts(fluid: FluidParameters, count: float | None) -> str:
 SURFACE = Product(
     stage="surface",
     about="surfaces of fluids",
-    version=3,
+    version=4,
     folder="surfaces",
     suffix=".ply",
     tools=_surface_tools,

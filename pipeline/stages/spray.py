@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from math import ceil
 from typing import TYPE_CHECKING
 
@@ -56,7 +57,7 @@ class SprayStage(Stage):
 
     name = "spray"
     about = "drops of fluids"
-    version = 2
+    version = 3
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame of each fluid."""
@@ -106,7 +107,7 @@ class SprayStage(Stage):
             to_drops = stack.enter_context(context.committing(task.outputs[1], validate_point_cloud))
             report = FrameReport(task.frame, task.frame / job.fps, {}, {}, {})
             write_frame(to_kinds, {task.subject: kinds}, report, device="cpu")
-            write_point_cloud(to_drops, _points(drops))
+            write_point_cloud(to_drops, _points(drops, bodies[task.subject]))
         spray = np.count_nonzero(state.kind == LiquidKind.SPRAY)
         context.progress(1, 1, f"{spray} particles of spray, {len(drops.radius)} drops")
 
@@ -182,7 +183,7 @@ def _drops(
     job: Job, bodies: Mapping[str, Snapshot], name: str, state: LiquidState, *, reach: Reach, solids: Obstacles
 ) -> tuple[Drops, float]:
     """The drops of a fluid's spray that are neither in liquid nor in walls and bodies; what has left [m³]."""
-    from sim.whitewater.drops import Drops, drops_of, in_the_air
+    from sim.whitewater.drops import drops_of, in_the_air
     from sim.whitewater.motion import FluidState
 
     fluid, particle_radius = FluidState.of_snapshots([bodies[name]]), bodies[name].number("particle_radius")
@@ -199,7 +200,7 @@ def _drops(
     # Half of a cloud at a wall would else be spread on it.
     position, velocity = solids.mirrored(drops.position, drops.velocity)
     position, velocity, _, stays = solids.collide(position, velocity, 1.0)
-    drops = Drops(position, velocity, drops.radius)
+    drops = replace(drops, position=position, velocity=velocity)
     has_left = ((position < job.domain.min) | (position > job.domain.max)).any(axis=1) & ~stays
     in_air = drops.kept(stays)
     for liquid in (fluid.position[state.kind != LiquidKind.SPRAY], *_other_liquid(job, bodies, name, particle_radius)):
@@ -224,13 +225,17 @@ def _other_liquid(
         yield fluid.position[np.isin(fluid.particle_id, whole)]
 
 
-def _points(drops: Drops) -> PointCloud:
-    """Drops as points of spray that do not fade."""
+def _points(drops: Drops, fluid: Snapshot) -> PointCloud:
+    """Drops as points of spray that do not fade, each with the dye of its particle where the fluid has some."""
     count = len(drops.radius)
+    dye = fluid.arrays.get("dye")
     return PointCloud(
         drops.position.astype(np.float32),
         drops.velocity.astype(np.float32),
         drops.radius.astype(np.float32),
         np.full(count, LIFETIME_S, np.float32),
         np.zeros(count, np.uint8),
+        dye=None
+        if dye is None
+        else dye[np.searchsorted(fluid.arrays["particle_id"], drops.particle_id)].astype(np.float32),
     )

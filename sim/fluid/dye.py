@@ -1,10 +1,11 @@
-"""Dye: a concentration that particles of a fluid carry, and that diffuses between neighbours.
+"""Dye: a concentration that particles carry, and that diffuses between neighbours, of one fluid or of two.
 
-Fick's law dc/dt = D div grad c, with the Laplacian of Brookshaw 1985 (Cleary & Monaghan 1999, eq. 13 of one material):
+Fick's law dc/dt = div(D grad c), with the Laplacian of Brookshaw 1985 for materials that differ (Cleary & Monaghan
+1999, eq. 13 and 14): with the harmonic mean of the diffusivities the flux is continuous,
 
-    dc_i/dt = 2 D V sum_j (c_i - c_j) x_ij . grad W_ij / |x_ij|²
+    dc_i/dt = 2 V sum_j D_ij (c_i - c_j) x_ij . grad W_ij / |x_ij|²,    D_ij = 2 D_i D_j / (D_i + D_j)
 
-over the neighbours of the same fluid. What i loses to j is what j gains, so that the dye of a tank stays the same to
+What i loses to j is what j gains, so that the dye of a tank stays the same to
 rounding; dye that a particle takes along through an open face is gone with it. Walls let none through, as they have no
 part in the sum. No value leaves the range of those that there were: steps longer than that allows are taken in parts.
 """
@@ -26,9 +27,11 @@ DYE = "dye"
 SQUEEZED = 2.0
 """How much more neighbours a particle exchanges with than in a lattice at rest, at most, for the length of a part."""
 
+TINY_DIFFUSIVITY = 1.0e-30  # [m²/s]; below it nothing is exchanged
+
 
 class Dye:
-    """Diffusion of the dye of all fluids of a tank."""
+    """Diffusion of the dye of a tank, within its fluids and from one to the other."""
 
     def __init__(self, fluids: Sequence[FluidParameters], discretization: Discretization, capacity: int) -> None:
         """Prepare for so many particles."""
@@ -60,7 +63,7 @@ def diffuse_dye(fluid: Fluid, diffusivity: Floats, dt: ti.f32, dye: Floats, dye_
     particles, near = ti.static((fluid.particles, fluid.near))
     ti.loop_config(block_dim=128)
     for i in range(particles.count):
-        x_i, c_i, own = particles.position[i], dye[i], particles.phase[i]
+        x_i, c_i, own = particles.position[i], dye[i], diffusivity[particles.phase[i]]
         exchange = 0.0
         first = near.start[i]
         for k in range(near.fluid_count[i]):
@@ -68,9 +71,10 @@ def diffuse_dye(fluid: Fluid, diffusivity: Floats, dt: ti.f32, dye: Floats, dye_
             x_ij = x_i - particles.position[j]
             r_squared = x_ij.norm_sqr()
             inverse_r = inverse_distance(r_squared)
-            alike = ti.cast(particles.phase[j] == own, ti.f32)
+            other = diffusivity[particles.phase[j]]
+            mean = 2.0 * own * other / ti.max(own + other, TINY_DIFFUSIVITY)
             # Two particles in one place have no slope, and exchange nothing.
             slope = spline_slope(r_squared * inverse_r * fluid.inverse_support) * inverse_r
-            exchange += alike * slope * (c_i - dye[j])
-        factor = 2.0 * diffusivity[own] * dt * fluid.volume * fluid.sigma * fluid.inverse_support
+            exchange += mean * slope * (c_i - dye[j])
+        factor = 2.0 * dt * fluid.volume * fluid.sigma * fluid.inverse_support
         dye_out[i] = c_i + factor * exchange

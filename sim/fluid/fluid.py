@@ -13,6 +13,7 @@ from sim.core.host_access import add, viewed
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Remedies
 from sim.fluid.dye import DYE, Dye
+from sim.fluid.exchange import HELD, Exchange
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
 from sim.fluid.kernels import Discretization
@@ -57,6 +58,7 @@ class SPHFluid(ABC):
         signal_speed: speed of the signals that limit the time step [m/s].
         tank: the particles, and what is around them: `particles`, `boundary` and `body_forces`.
         dye: its diffusion; None where no fluid has some.
+        exchange: of places; None where all fluids are as heavy.
         cohesion: surface tension, and what it asks of speeds and steps.
         forces: all but those of pressure.
         solves: the iterative solves of this frame, by what they are for.
@@ -85,18 +87,26 @@ class SPHFluid(ABC):
         self._stiffest = float(self.phases.viscosities.max()) * max(1.0, self.parameters.wall_friction)
         self._with_dye = any(fluid.has_dye for fluid in start.fluids)
         with_implicit = is_implicit(self.parameters, self._stiffest, self.signal_speed)
+        with_exchange = self.phases.density_contrast > 1.0 and any(start.gravity)
+        added = {CARRIED: with_implicit, (DYE,): self._with_dye, (HELD,): with_exchange}
         self.tank = ParticleTank(
             start,
             self.phases,
             self.discretization,
             skin=self.parameters.skin,
-            carried=(*self.carried, *(CARRIED if with_implicit else ()), *((DYE,) if self._with_dye else ())),
+            carried=(*self.carried, *(name for names, is_there in added.items() if is_there for name in names)),
             sheets_answer=self.sheets_answer,
             looks_ahead=self.looks_ahead,
         )
         self.particles, self.boundary = self.tank.particles, self.tank.boundary
         self.body_forces = self.tank.body_forces
         self.dye = Dye(start.fluids, self.discretization, self.particles.capacity) if self._with_dye else None
+        self.exchange: Exchange | None = None
+        if with_exchange:
+            first_of_sheets = self.boundary.sheets.first
+            self.exchange = Exchange(
+                self.particles.capacity, start.gravity, self.discretization.spacing, first_of_sheets
+            )
         self.gravity, self.spacing = start.gravity, self.discretization.spacing
         self.particle_volume = self.discretization.particle_volume
         self.forces = Forces(
@@ -149,9 +159,13 @@ class SPHFluid(ABC):
             record.clear()
 
     def advance(self, dt: float, frequency_squared: ti.Ndarray | None = None) -> None:
-        """Let dye diffuse, and move the particles by their acceleration, for a step of dt [s]."""
+        """Let dye diffuse, let those held change places, and move all by their acceleration, for a step of dt [s]."""
         if self.dye is not None:
             self.dye.diffuse(self.particles, self.tank.on_device, dt)
+        if self.exchange is not None and self.exchange.step(
+            self.particles, self.tank.on_device, self.forces.acceleration, dt
+        ):
+            self.tank.forget_neighbors()
         self.tank.advance(self.forces.acceleration, dt, frequency_squared)
         self._first_bad = self._first_bad or self._bad_motion()
 
@@ -180,8 +194,6 @@ class SPHFluid(ABC):
         for number, fluid in enumerate(self.phases.parameters):
             own = {name: array[phase == number] for name, array in arrays.items()}
             own["density"] = own["density"] * np.float32(fluid.rest_density)
-            if not fluid.has_dye:
-                own.pop(DYE, None)
             attributes = {"particle_radius": fluid.particle_radius, "rest_density": fluid.rest_density}
             snapshots[fluid.name] = Snapshot(kind="fluid", arrays=own, attributes=attributes)
         return snapshots

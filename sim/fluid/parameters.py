@@ -16,7 +16,7 @@ from sim.core.motion.parameters import (
 )
 from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.fluid.inflow import Inflow
-from sim.fluid.traits import CFL_NUMBER, TRAITS, VISCOUS_NUMBER
+from sim.fluid.traits import CFL_NUMBER, KEPT_OFF_SHEETS, TRAITS, VISCOUS_NUMBER
 from sim.shapes.parameters import Placement, Shape
 
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
@@ -182,7 +182,8 @@ class FluidParameters(Parameters):
     dye_diffusivity: NonNegative = Field(
         default=5.0e-10,
         description="Diffusivity of the dye between its particles [m²/s]: of dyes in water 3e-10 to 1e-9, so that they "
-        "mix by flow alone; more stands for swirls that are finer than the particles.",
+        "mix by flow alone; more stands for swirls that are finer than the particles. Between those of two fluids it "
+        "is the harmonic mean of both; 0 keeps dye where it is.",
     )
     rest_density: Positive = Field(default=1000.0, description="Rest density [kg/m³].")
     viscosity: NonNegative = Field(default=1.0e-6, description="Kinematic viscosity nu [m²/s]; water 1e-6.")
@@ -260,14 +261,24 @@ class FluidParameters(Parameters):
         return 2.0 * self.particle_radius
 
     @property
+    def kept_off_sheets(self) -> float:
+        """What it keeps off cloth, where it touches walls and bodies [m]."""
+        return KEPT_OFF_SHEETS * self.support_in_spacings * self.spacing
+
+    @property
     def lattice_volume(self) -> float:
         """Volume that a particle takes of a block, d³ [m³]."""
         return self.spacing**3
 
     @property
+    def dyes(self) -> set[float]:
+        """The concentrations of dye that it starts, or flows in, with."""
+        return {each.dye for each in (*self.block, *self.emitter)}
+
+    @property
     def has_dye(self) -> bool:
         """Whether some of it starts, or flows in, with a dye."""
-        return any(each.dye > 0.0 for each in (*self.block, *self.emitter))
+        return max(self.dyes) > 0.0
 
     @property
     def most_volume(self) -> float:
@@ -294,14 +305,6 @@ class FluidParameters(Parameters):
                 f'surface_tension_model = "csf" needs support_in_spacings = 2, at which it is calibrated, not '
                 f"{self.support_in_spacings:g}"
             )
-        dyes = {each.dye for each in (*self.block, *self.emitter)}
-        if len(dyes) == 1 and dyes != {0.0}:
-            raise ValueError(
-                f"has a dye of {dyes.pop():g} everywhere, and nothing to mix with; give a block or an emitter another "
-                "one, or remove dye and name the color of its material"
-            )
-        if dyes == {0.0} and "dye_diffusivity" in self.model_fields_set:
-            raise ValueError("dye_diffusivity has no meaning without dye; remove it or give a block or emitter a dye")
         return self
 
 
@@ -336,6 +339,20 @@ def shared_conflicts(fluids: Sequence[FluidParameters]) -> list[tuple[int, str, 
             )
             conflicts.append((number, "rest_density", reason))
     return conflicts
+
+
+def dye_conflict(fluids: Sequence[FluidParameters]) -> tuple[int, str] | None:
+    """The first fluid of a tank whose dye can do nothing, and why."""
+    dyes: set[float] = set().union(*(fluid.dyes for fluid in fluids))
+    for number, fluid in enumerate(fluids):
+        if len(dyes) == 1 and fluid.has_dye:
+            return number, (
+                f"has a dye of {max(dyes):g} everywhere, and nothing to mix with; give a block or an emitter another "
+                "one, or remove dye and name the color of its material"
+            )
+        if dyes == {0.0} and "dye_diffusivity" in fluid.model_fields_set:
+            return number, "dye_diffusivity has no meaning without dye; remove it or give a block or emitter a dye"
+    return None
 
 
 def _written(value: object) -> str:

@@ -229,6 +229,10 @@ class ParticleTank:
         self._wall_contacts += self.motion.touched
         self._substeps += 1
 
+    def forget_neighbors(self) -> None:
+        """Have the neighbours found anew before they are needed next: particles changed places."""
+        self._without_neighbors = True
+
     def update_neighbors(self) -> None:
         """Find the neighbours anew where a pair could have closed the skin between them, or particles left or came."""
         travelled = self._travelled + (self.motion.max_displacement if self._looks_ahead else 0.0)

@@ -59,6 +59,7 @@ class Drops:
     position: NDArray[np.float64]  # [m], (n, 3)
     velocity: NDArray[np.float64]  # [m/s], (n, 3)
     radius: NDArray[np.float64]  # [m], (n,)
+    particle_id: NDArray[np.int32]  # of the particle that each is of, (n,)
 
     @property
     def volume(self) -> float:
@@ -67,7 +68,7 @@ class Drops:
 
     def kept(self, rows: NDArray[np.bool_]) -> Drops:
         """The drops of a mask (n,)."""
-        return Drops(self.position[rows], self.velocity[rows], self.radius[rows])
+        return Drops(self.position[rows], self.velocity[rows], self.radius[rows], self.particle_id[rows])
 
 
 def atomizes(*, viscosity: float, rest_density: float, particle_radius: float) -> bool:
@@ -150,6 +151,7 @@ def drops_of(
         fluid.position[rows].astype(np.float64)[owner] + width[owner, None] * place,
         velocity[owner] + reach.rate[rows][owner, None] * place,
         2.0 * particle_radius * np.cbrt(share / (4.0 / 3.0 * math.pi)),
+        particle_id[owner],
     )
 
 

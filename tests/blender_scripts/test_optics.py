@@ -67,4 +67,4 @@ def test_light_through_a_ball_is_the_mean_over_its_disc(look, diameter):
     share = (np.arange(20_000) + 0.5) / 20_000  # of the disc's area
     chord = diameter * np.sqrt(1.0 - share)
     expected = [np.exp(-each * chord).mean() for each in per_metre(look, 1.0)]
-    np.testing.assert_allclose(through_ball(look, diameter, 1.0), expected, rtol=1e-4)
+    np.testing.assert_allclose(through_ball(per_metre(look, 1.0), diameter), expected, rtol=1e-4)

@@ -48,6 +48,19 @@ def test_a_cloud_reads_back_as_written(tmp_path, count):
     validate_point_cloud(path)
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(read_point_cloud(path), name), getattr(cloud, name))
+    assert read_point_cloud(path).dye is None
+
+
+def test_drops_of_a_fluid_with_dye_have_it(tmp_path):
+    path, dye = tmp_path / "points.ply", np.linspace(0.0, 1.0, 50, dtype=np.float32)
+    write_point_cloud(path, replace(some_points(), dye=dye, not_made=2_000_000_000))
+    validate_point_cloud(path)
+    np.testing.assert_array_equal(read_point_cloud(path).dye, dye)
+    assert read_point_counts(path).points == 50
+    np.testing.assert_array_equal(trimesh.load(path, process=False).vertices, some_points().position)
+    write_point_cloud(path, replace(some_points(), dye=np.full(50, np.nan, np.float32)))
+    with pytest.raises(InvalidFileError, match="dye of point 0 is not finite"):
+        validate_point_cloud(path)
 
 
 def test_what_had_no_room_is_told_by_the_header_alone(tmp_path):

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CASES = (
-    "kernel", "hydrostatic", "dam-break", "box-impact", "turned-jet", "elliptical-drop", "swinging-drop", "viscosity",
+    "kernel", "hydrostatic", "dam-break", "box-impact", "turned-jet", "rayleigh-taylor", "elliptical-drop",
+    "swinging-drop", "viscosity",
     "free-momentum", "coupled-momentum", "rigid-motion", "rigid-contacts", "inertia", "cloth", "cloth-crossings",
     "smoke-vortices", "smoke-projection", "smoke-plume", "smoke-front", "smoke-mass", "submerged-sphere", "buoyancy",
     "bunny-energy",

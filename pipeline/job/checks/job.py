@@ -4,6 +4,7 @@ from math import log2
 from pathlib import Path
 
 from blender_scripts.look_table import LOOK_TABLE, MATERIAL_KEYS, looks_for
+from blender_scripts.optics import INSIDES
 from pipeline.job.checks.camera import check_camera
 from pipeline.job.checks.optical_depth import check_optical_depths
 from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_set
@@ -106,16 +107,17 @@ def _check_materials(job: Job, findings: Findings) -> None:
 def _check_dye(job: Job, findings: Findings) -> None:
     """Warn of dye that no picture shows, and of the colour of a dye that is not there."""
     dyed = {fluid.name for fluid in job.fluid if fluid.has_dye}
-    cloudy = [name for name, row in LOOK_TABLE.items() if "dye_color" in row.keys]
+    reached = {fluid.name for fluid in job.fluid} if dyed else set()  # it goes from one fluid of a tank into the others
+    showing = [name for name in INSIDES if "dye_color" in LOOK_TABLE[name].keys]
     for index, fluid in enumerate(job.fluid):
         material = described_material(job, fluid.name)
         if fluid.name not in dyed or material.look is None:
             continue
-        if material.look not in cloudy:
+        if material.look not in showing:
             findings.warn(
                 ("fluid", index),
-                f'has dye, and its look "{material.look}" does not show it: the colour of a clear liquid is that of '
-                f"its depth, and dye is drawn on surfaces alone; use {quoted_list(cloudy)}, or read it from the frames",
+                f'has dye, and its look "{material.look}" does not show it; use {quoted_list(showing)}, or read it '
+                "from the frames",
             )
         elif material.dye_color is None:
             findings.warn(
@@ -123,7 +125,7 @@ def _check_dye(job: Job, findings: Findings) -> None:
             )
     for written, said in job.material.items():
         meant = [body.name for _, _, body in bodies(job) if is_meant(written, body.name)]
-        if said.dye_color is not None and meant and not dyed & set(meant):
+        if said.dye_color is not None and meant and not reached & set(meant):
             findings.warn(
                 ("material", written, "dye_color"),
                 f'has no effect, as "{meant[0]}" has no dye; give a [[fluid.block]] or [[fluid.emitter]] of it a dye',

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from blender_scripts.optics import INSIDES, per_metre, usual_density
+from blender_scripts.optics import INSIDES, dye_per_metre, per_metre, usual_density
 from pipeline.kinds.base import Kind
 from pipeline.kinds.table import bodies, is_meant, material_of
 from pipeline.model.job import Job
@@ -38,6 +38,10 @@ def _check(job: Job, path: KeyPath, kind: Kind, body: Any, material: MaterialPar
     )
     if material.density is None:
         return  # the job's own colour may be meant to be clear
+    if not is_smoke and material.dye_color is not None and not INSIDES[material.look].scatters:
+        dye = dye_per_metre(material.look, density, material.color, material.dye_color)
+        if size * max(dye) >= LEAST_DEPTH:
+            return  # it is clear where there is no dye, and the dye is seen
     if max(depths) < LEAST_DEPTH:
         outcome = "the smoke is not seen" if is_smoke else "the tint is not seen"
     elif is_smoke and min(depths) > WALL_DEPTH:

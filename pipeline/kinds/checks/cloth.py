@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
-from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over
+from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over, note_gaps
 from pipeline.kinds.checks.cloth_start import ClothStart, start_cloths
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.pins import check_pin_load, check_pin_speeds, check_pin_times
@@ -59,6 +59,7 @@ def check_cloths(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         check_pin_speeds(start, job, findings)
         check_pin_load(start, job, fluid_over(job, solids, start.box), findings)
         check_buoyancy(job, start.path, start.cloth, findings)
+        note_gaps(job, start.path, start.cloth, findings)
         for path, solid in solids.items():
             if path[0] == "rigid":
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)

@@ -36,8 +36,14 @@ def test_a_vertex_has_the_dye_of_the_particles_around_it(is_dyed, tmp_path):
     mesh = read_ply(tmp_path / "milk.ply")
     if not is_dyed:
         assert mesh.dye is None
+        assert mesh.dye_behind is None
         return
     x, dye = mesh.vertices[:, 0], mesh.dye[:, 0]
     assert (dye[x < 0.07] == 1.0).all() and (dye[x > 0.17] == 0.0).all()
     between = dye[np.abs(x - 0.12) < 0.005]
     assert 0.2 < between.mean() < 0.8
+    # Straight behind the left face lies the dyed half, behind the bottom all that is above it.
+    behind, inner = mesh.dye_behind[:, 0], (np.abs(mesh.vertices[:, 1:] - 0.06) < 0.03).all(axis=1)
+    assert behind[inner & (x < 0.01)].mean() == pytest.approx(0.12, rel=0.05)
+    assert (behind[x > 0.2] < 0.14).all()
+    assert behind[(x > 0.15) & (mesh.normals[:, 2] < -0.99)].max() == 0.0

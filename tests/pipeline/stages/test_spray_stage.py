@@ -85,6 +85,15 @@ def test_drops_of_a_clear_liquid_have_the_colour_of_light_through_one_of_them():
     assert own.color == (0.1, 0.2, 0.3)
 
 
+def test_drops_go_from_the_colour_of_the_liquid_to_that_of_its_dye():
+    look, red = {"look": "water", "density": 900.0, "color": (0.99, 0.99, 0.99)}, (0.9, 0.05, 0.1)
+    dyed = drawn("water.drops", water={**look, "dye_color": red})
+    assert dyed.color == drawn("water.drops", water=look).color
+    assert dyed.dye_color == pytest.approx(drawn("water.drops", water={**look, "color": red}).color, rel=1e-4)
+    milk = drawn("water.drops", water={"look": "milk", "dye_color": (0.9, 0.05, 0.1)})
+    assert milk.dye_color == (0.9, 0.05, 0.1)
+
+
 def test_drops_of_a_cloudy_liquid_are_as_the_job_says():
     said = drawn(
         "water.drops", water={"look": "milk"}, **{"water.drops": {"look": "plastic", "color": (0.1, 0.2, 0.3)}}
@@ -207,6 +216,23 @@ def test_frames_that_are_gone_are_made_again_with_the_same_bits_by_any_number_of
     assert run_in_a_process(copy, names_of("spray", range(4, 8)), threads=1).count("Finished") == 4
     for artifact in made:
         assert copy.path(artifact).read_bytes() == splash.path(artifact).read_bytes()
+
+
+def test_drops_have_the_dye_of_the_particle_that_they_are_of(splash, tmp_path):
+    copy = JobLayout(tmp_path / "tank")
+    shutil.copytree(splash.root / "cache", copy.root / "cache")
+    copy.job_file.write_text(splash.job_file.read_text())
+    path = copy.path(copy.frame_cache(0))
+    bodies = read_frame(path).bodies
+    water = bodies["water"].arrays
+    dye = np.random.default_rng(2).uniform(size=len(water["position"])).astype(np.float32)
+    bodies["water"] = Snapshot("fluid", water | {"dye": dye}, bodies["water"].attributes)
+    write_frame(path, bodies, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
+    assert run_in_a_process(copy, names_of("spray", range(1))).count("Finished") == 1
+    drops = read_point_cloud(copy.path(copy.drops("water", 0)))
+    owner = np.array([np.flatnonzero(dye == each).item() for each in drops.dye])
+    assert len(set(owner.tolist())) > 20
+    assert np.linalg.norm(drops.position - water["position"][owner], axis=1).max() < 5.0 * RADIUS
 
 
 def test_without_drops_every_particle_is_of_the_surface(splash, tmp_path):

@@ -8,6 +8,7 @@ from sim.cloth.solver import ClothSolver
 from sim.core.domain import DomainParameters
 from sim.coupling.cloth_fluid import ClothSamples
 from sim.fluid.kernels import evaluate, particle_volume
+from sim.fluid.parameters import FluidParameters
 from sim.fluid.sheets import AMID_SAMPLES, kept_away, sheet_standoff
 
 SPACING = 0.02
@@ -56,3 +57,11 @@ def test_the_water_that_stays_away_is_that_around_the_sheet_less_its_own_volume(
     margin = kept_away() * SPACING
     around = 2.0 * margin * 0.04 + 0.5 * np.pi * margin**2 * 0.8
     assert samples.sheets.missing_volume.sum() == pytest.approx(around - 0.002 * 0.04)
+
+
+@pytest.mark.parametrize("support", [2.0, 2.5, 3.0, 4.0])
+def test_what_checks_and_pictures_take_for_the_gap_is_the_solvers(support):
+    box = {"shape": {"type": "box", "size": (1, 1, 1)}}
+    water = FluidParameters.model_validate({"name": "water", "block": [box], "support_in_spacings": support})
+    wanted = kept_away(support) * water.spacing
+    assert water.kept_off_sheets == pytest.approx(wanted, rel=1e-3 if support == 2.0 else 0.1)

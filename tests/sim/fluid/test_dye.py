@@ -105,13 +105,66 @@ def test_dye_goes_with_its_particles_and_not_beyond_them_without_diffusion(taich
     assert (moved["position"] - points).min() > 0.1
 
 
-def test_dye_stays_in_its_fluid(taichi_cpu):
-    """Two fluids side by side, which do not mix: neither has any of the other's."""
+def side_by_side(points, dye, *diffusivities):
+    """Two fluids, left and right of x = 0, which do not flow."""
+    keys = {"solver": "dfsph", "particle_radius": SPACING / 2, "block": HALVES}
+    fluids = tuple(
+        FluidParameters.model_validate({"name": name, **keys, "dye_diffusivity": each})
+        for name, each in zip(("left", "right"), diffusivities, strict=True)
+    )
+    return dyed(points, dye, fluids=fluids, phase=(points[:, 0] > 0.0).astype(np.int32))
+
+
+def test_dye_goes_from_one_fluid_into_the_other(taichi_cpu):
+    """Of two media, one four times as diffusive: profile of Carslaw & Jaeger, the dye of both together stays."""
+    points = lattice((-0.2, -0.04, -0.04), (0.2, 0.04, 0.04), SPACING)
+    left, right = 2.0e-3, 5.0e-4
+    fluid = side_by_side(points, points[:, 0] < 0.0, left, right)
+    before = float(np.count_nonzero(points[:, 0] < 0.0))
+    time = 2.0e-3 / left
+    for _ in range(20):
+        fluid.substep(time / 20)
+    names = "left", "right"
+    arrays = [fluid.snapshots()[name].arrays for name in names]
+    assert sum(each["dye"].astype(np.float64).sum() for each in arrays) == pytest.approx(before, rel=1e-6)
+    # The flux is continuous: c is sqrt(D_left)/(sqrt(D_left) + sqrt(D_right)) on the interface, and stays so.
+    ratio = np.sqrt(right / left)
+    for each, side in zip(arrays, (left, right), strict=True):
+        x = each["position"][:, 0].astype(np.float64)
+        reached = erf(np.abs(x) / np.sqrt(4.0 * side * time))
+        expected = (1.0 + ratio * reached) / (1.0 + ratio) if side == left else (1.0 - reached) / (1.0 + ratio)
+        assert np.abs(each["dye"] - expected)[np.abs(x) < 0.1].max() < 0.025
+
+
+@pytest.mark.parametrize("solver", ["dfsph", pytest.param("wcsph", marks=pytest.mark.slow)])
+def test_the_dye_of_two_fluids_that_change_places_stays_the_same(taichi_cpu, solver):
+    def fluid(name, density, height, dye):
+        shape = {"type": "box", "size": (0.1, 0.1, 0.05)}
+        block = {"shape": shape, "position": (0.05, 0.05, height), "dye": dye}
+        keys = {"solver": solver, "particle_radius": SPACING / 2, "dye_diffusivity": 1.0e-4}
+        return {"name": name, "rest_density": density, "block": [block], **keys}
+
+    scene = {
+        "domain": {"min": (0.0, 0.0, 0.0), "max": (0.1, 0.1, 0.2)},
+        "fluid": [fluid("oil", 700.0, 0.025, 1.0), fluid("water", 1000.0, 0.075, 0.0)],
+    }
+    world = build_world(SceneParameters.model_validate(scene), frames_per_second=30.0)
+
+    def dyes():
+        return [world.snapshots()[name].arrays["dye"].astype(np.float64) for name in ("oil", "water")]
+
+    before = sum(each.sum() for each in dyes())
+    for _ in range(60):
+        world.advance_frame()
+    oil, water = dyes()
+    assert oil.sum() + water.sum() == pytest.approx(before, rel=1e-6)
+    assert water.mean() > 0.1
+    assert min(oil.min(), water.min()) > -1e-6 and max(oil.max(), water.max()) < 1.0 + 1e-6
+
+
+def test_dye_stays_in_its_fluid_where_the_other_takes_none(taichi_cpu):
     points = lattice((-0.1, -0.03, -0.03), (0.1, 0.03, 0.03), SPACING)
-    keys = {"solver": "dfsph", "particle_radius": SPACING / 2, "block": HALVES, "dye_diffusivity": 1.0e-2}
-    fluids = tuple(FluidParameters.model_validate({"name": name, **keys}) for name in ("left", "right"))
-    phase = (points[:, 0] > 0.0).astype(np.int32)
-    fluid = dyed(points, 0.25 + 0.5 * phase, fluids=fluids, phase=phase)
+    fluid = side_by_side(points, 0.25 + 0.5 * (points[:, 0] > 0.0), 1.0e-2, 0.0)
     for _ in range(10):
         fluid.substep(1e-3)
     np.testing.assert_array_equal(dye_of(fluid, "left"), 0.25)
@@ -176,4 +229,11 @@ def test_what_an_emitter_brings_has_its_dye_and_a_run_continues_to_the_bit(taich
 )
 def test_dye_that_cannot_act_is_refused(keys, rule):
     with pytest.raises(ValueError, match=rule):
-        FluidParameters.model_validate({"name": "water", **keys})
+        SceneParameters.model_validate({"fluid": [{"name": "water", **keys}]})
+
+
+def test_a_fluid_of_one_dye_may_mix_with_another(taichi_cpu):
+    first = {"name": "red", "block": [{"shape": BOX, "dye": 1.0}]}
+    other = {"name": "clear", "block": [{"shape": BOX}], "dye_diffusivity": 1e-9}
+    scene = SceneParameters.model_validate({"fluid": [first, other]})
+    assert [fluid.has_dye for fluid in scene.fluid] == [True, False]

@@ -2,17 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
-from small_fluids import EARTH, lattice
+from small_fluids import lattice
 
 from sim.build import build_world
-from sim.core.domain import DomainParameters
-from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.parameters import LARGEST_DENSITY_CONTRAST, FluidParameters, shared_conflicts
-from sim.fluid.solvers import SOLVERS
-from sim.fluid.tank import FluidStart
 from sim.scene import SceneParameters
-from validation.scenes import advance
 
 TANK = {"min": (-0.06, -0.06, 0.0), "max": (0.06, 0.06, 0.3)}
 
@@ -150,48 +144,3 @@ def test_what_fluids_must_share_is_told_with_both_places():
     ((_, key, message),) = shared_conflicts([fluid(), fluid(rest_density=1.2)])
     assert key == "rest_density"
     assert "by a factor of 10 at most" in message
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])
-def test_a_wave_of_water_over_oil_grows_at_the_rate_of_rayleigh_and_taylor(taichi_cpu, solver):
-    """sigma² = A g k tanh(k h) (Taylor 1950), from rest a = a0 cosh(sigma t), in water without viscosity."""
-    spacing, length, width, depth, start = 0.005, 0.32, 0.03, 0.08, 0.008
-    wave = 2.0 * np.pi / length
-    points = lattice((0.0, 0.0, 0.0), (length, width, 2.0 * depth), spacing)
-    box = [{"shape": {"type": "box", "size": (1, 1, 1)}}]
-    smooth = {"block": box, "particle_radius": spacing / 2, "wall_friction": 0.0, "artificial_viscosity": 0.0}
-    fluids = (("oil", 700.0), ("water", 1000.0))
-    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(length, width, 2.8 * depth))
-    fluid = SOLVERS[solver](
-        FluidStart(
-            tuple(
-                FluidParameters.model_validate({"name": name, "solver": solver, "rest_density": density, **smooth})
-                for name, density in fluids
-            ),
-            domain=domain,
-            gravity=EARTH,
-            positions=points,
-            velocities=np.zeros_like(points),
-            boundary=BoundarySamples.of_bodies(domain_wall_samples(domain, spacing)),
-            phase=(points[:, 2] > depth + start * np.cos(wave * points[:, 0])).astype(np.int32),
-        )
-    )
-
-    def amplitude() -> float:
-        """First cosine of the height of the interface: the oil fills what is below."""
-        x = fluid.snapshots()["oil"].arrays["position"][:, 0].astype(np.float64)
-        return 2.0 * fluid.particle_volume * float(np.cos(wave * x).sum()) / (length * width)
-
-    times, amplitudes = [0.0], [amplitude()]
-    while wave * amplitudes[-1] < 0.6:  # slope of the interface up to which theory is linear
-        for _ in advance(fluid, 0.01):
-            pass
-        times.append(times[-1] + 0.01)
-        amplitudes.append(amplitude())
-        assert times[-1] < 0.6
-    growth = np.array(amplitudes) / amplitudes[0]
-    rate = least_squares(lambda sigma: growth - np.cosh(sigma * np.array(times)), [5.0]).x[0]
-    exact = np.sqrt(300.0 / 1700.0 * 9.81 * wave * np.tanh(wave * depth))
-    # 64 particles along the wave. At 32 it is 0.78: the layer in which the fluids slide along each other counts.
-    assert rate == pytest.approx(exact, rel=0.15)

@@ -254,6 +254,6 @@ def test_honey_and_fine_drops_do_not_break_up_and_water_does():
 
 def test_drops_in_the_liquid_are_left_out():
     position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.9 * RADIUS], [0.0, 0.0, 1.1 * RADIUS]])
-    drops = Drops(position, np.zeros_like(position), np.full(3, 1e-4))
+    drops = Drops(position, np.zeros_like(position), np.full(3, 1e-4), np.arange(3, dtype=np.int32))
     left = in_the_air(drops, np.zeros((1, 3), np.float32), particle_radius=RADIUS)
     np.testing.assert_array_equal(left.position, position[2:])

@@ -193,7 +193,11 @@ DYED = (
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (DYED, 'fluid[0]: has dye, and its look "water" does not show it ... "milk", "juice" or "muddy_water"'),
+        (
+            DYED + '[material.water]\nlook = "rubber"\n',
+            'fluid[0]: has dye, and its look "rubber" does not show it ... "juice" or "muddy_water"',
+        ),
+        (DYED, "fluid[0]: has dye ... add dye_color to [material.water]"),
         (DYED + '[material.water]\nlook = "milk"\n', "fluid[0]: has dye ... add dye_color to [material.water]"),
         (
             WATER + '[material.water]\nlook = "milk"\ndye_color = [0.5, 0.0, 0.0]\n',
@@ -207,8 +211,17 @@ def test_dye_that_no_picture_shows_is_told(text, expected, tmp_path):
     assert any(says(warning.partition(" ")[2], expected) for warning in warnings), warnings
 
 
-def test_dye_in_milk_with_its_colour_passes_without_a_word(tmp_path):
-    text = DYED + '[material.water]\nlook = "milk"\ndye_color = [0.5, 0.0, 0.0]\n'
+@pytest.mark.parametrize("look", ["milk", "water"])
+def test_dye_in_a_liquid_with_its_colour_passes_without_a_word(look, tmp_path):
+    text = DYED + f'[material.water]\nlook = "{look}"\ndye_color = [0.5, 0.0, 0.0]\n'
     errors, warnings, _ = checked(HEAD + text, tmp_path / "dam.toml")
     assert errors == []
     assert not [warning for warning in warnings if "dye" in warning]
+
+
+def test_the_colour_of_dye_that_comes_from_another_fluid_has_an_effect(tmp_path):
+    other = DYED.replace('"water"', '"oil"').replace("[0.0, 0.0, 0.5]", "[0.0, 0.0, 0.2]").replace("0.4]", "0.1]")
+    colors = "".join(f"[material.{name}]\ndye_color = [0.5, 0.0, 0.0]\n" for name in ("water", "oil"))
+    errors, warnings, _ = checked(HEAD + WATER + other + colors, tmp_path / "dam.toml")
+    assert errors == []
+    assert not [warning for warning in warnings if "dye" in warning], warnings

@@ -59,3 +59,13 @@ def test_the_table_that_gives_a_density_to_many_bodies_is_the_one_that_is_told(t
 def test_clear_water_and_thick_milk_are_meant(tmp_path):
     for keys in ("water.color = [1.0, 1.0, 1.0]", 'water = { look = "milk", density = 50.0 }'):
         assert findings(tmp_path, f"[material]\n{keys}")[0] == []
+
+
+def test_water_that_is_clear_but_for_its_dye_is_meant(tmp_path):
+    dyed = SCENE + "dye = 1.0\n" + '[[fluid.block]]\nshape = { type = "box", size = [0.1, 0.1, 0.1] }\n'
+    for density, seen in ((5.0, True), (0.01, False)):
+        look = f"[material.water]\ndensity = {density}\ncolor = [1.0, 1.0, 1.0]\ndye_color = [0.9, 0.1, 0.1]\n"
+        result = checked(dyed + "position = [0.4, 0.4, 0.1]\n" + look, tmp_path / "film.toml")
+        assert result.errors == []
+        told = [each for each in result.warnings if "optical depth" in each]
+        assert len(told) == (not seen)
