@@ -19,7 +19,7 @@ from sim.cloth.bundles import (
 from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
-from sim.core.launch import kernel
+from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Share, is_finite, reduced_tree, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
@@ -49,7 +49,7 @@ SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
 
-@kernel
+@large_kernel
 def look_at_patches(
     vertex_count: ti.i32,
     nodes: TrackedNodes,

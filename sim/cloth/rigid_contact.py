@@ -27,10 +27,10 @@ from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision import Box
 from sim.cloth.self_collision_kernels import lanes_of_pair
 from sim.cloth.state import ClothState
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.host_access import put
-from sim.core.launch import kernel
+from sim.core.launch import kernel, large_kernel
 from sim.core.motion.paths import Poses
 from sim.core.reductions import LaneReduction, Share, reduced
 from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
@@ -116,7 +116,7 @@ class RigidContact:
         self.bodies = CollisionBodies(geometries, friction)
         self._motion: BodyMotion | None = None
         self._advance = LARGEST_ADVANCE * 0.5 * np.array([geometry.shortest_edge for geometry in geometries])
-        self._advance_on_device = ti.ndarray(ti.f32, max(len(geometries), 1))
+        self._advance_on_device = on_device(self._advance)
         self._moving = ti.Vector.ndarray(4, ti.f32, max(len(geometries), 1))
         self._rates = LaneReduction(maxima=1, sums=0)
         self._is_warm = False  # `fastest_approach` is compiled in the first step, not in the first fast one
@@ -126,26 +126,17 @@ class RigidContact:
         self._shows = np.zeros(len(geometries), dtype=bool)
         self._longest, self._largest_half = 0.0, 0.0
         self._taken = ti.ndarray(ti.i32, 2)
-        if geometries:
-            put(self._advance_on_device, self._advance)
-        room = max(len(walls), 1)
-        corners = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(4))
-        self._walls = Walls(len(walls), 0.0, ti.Vector.ndarray(4, ti.f32, room), *corners)
-        if walls:
-            low, high = np.full((room, 3), -np.inf), np.full((room, 3), np.inf)
-            joined = {side: np.zeros((room, 3)) for side in (1.0, -1.0)}
-            for number, wall in enumerate(walls):
-                others = [axis for axis in range(3) if axis != wall.axis]
-                low[number, others], high[number, others] = wall.lower, wall.upper
-                for other in walls:
-                    if other.axis != wall.axis:
-                        joined[other.side][number, other.axis] = 1.0
-            planes = np.array([[*wall.normal, wall.side * wall.offset] for wall in walls])
-            self._walls.plane.from_numpy(planes.astype(np.float32))
-            self._walls.low.from_numpy(low.astype(np.float32))
-            self._walls.high.from_numpy(high.astype(np.float32))
-            self._walls.joined_low.from_numpy(joined[1.0].astype(np.float32))
-            self._walls.joined_high.from_numpy(joined[-1.0].astype(np.float32))
+        low, high = np.full((len(walls), 3), -np.inf), np.full((len(walls), 3), np.inf)
+        joined = {side: np.zeros((len(walls), 3)) for side in (1.0, -1.0)}
+        for number, wall in enumerate(walls):
+            others = [axis for axis in range(3) if axis != wall.axis]
+            low[number, others], high[number, others] = wall.lower, wall.upper
+            for other in walls:
+                if other.axis != wall.axis:
+                    joined[other.side][number, other.axis] = 1.0
+        planes = np.reshape([[*wall.normal, wall.side * wall.offset] for wall in walls], (len(walls), 4))
+        arrays = (on_device(each) for each in (planes, low, high, joined[1.0], joined[-1.0]))
+        self._walls = Walls(len(walls), 0.0, *arrays)
 
     def set_spacing(self, mean_edge: float, longest: float) -> None:
         """Say how long edges of the coarsest cloth are, and the longest of all [m]."""
@@ -339,7 +330,6 @@ def touch_body(
     own_friction: ti.f32,
     corners: Four,
     weight: ti.math.vec4,
-    is_vertex: ti.template(),
     across: ti.math.mat3,
     half: ti.f32,
     recovery: ti.f32,
@@ -363,13 +353,12 @@ def touch_body(
             ti.atomic_max(bodies.depth[b], -0.5 * distance / half)
         if distance < keeps + relative.norm():
             gradient = ti.math.vec3(0.0)
-            for axis in ti.static(range(3)):
+            for axis in range(3):  # not unrolled: a distance takes long to compile
                 ahead = ti.math.vec3(0.0)
                 ahead[axis] = bodies.step[b]
                 gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
             n = turned @ unit_or(gradient, y)
-            if ti.static(not is_vertex):
-                n = unit_or(across @ n, n)
+            n = unit_or(across @ n, n)
             least = least_displacement(distance, keeps, recovery)
             if distance < keeps or n.dot(relative) < least:
                 slot = ti.atomic_add(contacts.counter[0], 1)
@@ -407,7 +396,7 @@ def deepest_on_triangle(y: Corners, in_middle: ti.f32, b: ti.i32, shapes: Shapes
     return best
 
 
-@kernel
+@large_kernel
 def find_rigid_contacts(
     patches: PatchLists,
     work: ti.math.ivec2,
@@ -460,7 +449,6 @@ def find_rigid_contacts(
                             surface.friction[i],
                             Four(i),
                             ti.math.vec4(1.0, 0.0, 0.0, 0.0),
-                            True,
                             ti.Matrix.identity(ti.f32, 3),
                             ti.select(inverse_mass[i] > 0.0, half, 0.0),
                             recovery,
@@ -561,7 +549,6 @@ def touch_triangle(
                         surface.friction[v[0]],
                         Four(v[0], v[1], v[2], v[0]),
                         ti.math.vec4(share[0], share[1], share[2], 0.0),
-                        False,
                         across,
                         half,
                         recovery,

@@ -17,6 +17,7 @@ from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision_kernels import lanes_of_pair, range_of_vectors
+from sim.core.arrays import on_device
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
@@ -50,6 +51,7 @@ class SelfCollision:
         thickness: the largest [m].
         mean_edge: at rest, of all cloths together [m]; how far lists reach.
         coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart. `longest_edge` of all.
+        meets: whether any elements may meet: of several cloths, or of one that collides with itself.
         searches: how many pairs of patches were searched since `begin_frame`, over the number of patches.
 
     Args:
@@ -59,8 +61,7 @@ class SelfCollision:
     def __init__(self, state: ClothState) -> None:
         self._patches = Patches(state.host)
         self._met = PatchPairs(self._patches)
-        self._rest = Rest(state.body, ti.Vector.ndarray(3, ti.f32, state.vertex_count))
-        self._rest.position.from_numpy(state.host.position.astype(np.float32))
+        self._rest = Rest(state.body, on_device(state.host.position))
         blocks = ElementBlocks(self._patches)
         self._blocks = PatchBlocks(self._patches.vertex_lists, blocks.triangles, blocks.edges)
         self._collides = ti.ndarray(ti.i32, len(state.names))
@@ -96,7 +97,8 @@ class SelfCollision:
             self.thickness = float(thickness.max())
             self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
             self.forget()
-        self._met.set_margin(self.thickness)
+        self.meets = len(state.names) > 1 or any(state.self_collision)
+        self._met.set_margin(self.thickness, fits=self.meets)
 
     @property
     def searches(self) -> float:
@@ -105,7 +107,8 @@ class SelfCollision:
 
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
-        motion, holds = self._met.look(state, None if self._is_forgotten or self._is_outrun else self._ageing)
+        is_aged = self.meets and not (self._is_forgotten or self._is_outrun)
+        motion, holds = self._met.look(state, self._ageing if is_aged else None)
         self._is_outrun |= not holds
         return motion
 
@@ -114,7 +117,9 @@ class SelfCollision:
         """How pairs of patches are aged."""
         edge = self.mean_edge
         least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        return Ageing(self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due)
+        return Ageing(
+            self.thickness, least_skin, self.with_triangles.on_device.piece_due, self.of_edges.on_device.piece_due
+        )
 
     def warm_up(self) -> None:
         """Compile what carries lists over."""
@@ -140,6 +145,8 @@ class SelfCollision:
             recovery: share of a missing distance that the substep gives back [-].
         """
         met, lists = self._met, (self.with_triangles, self.of_edges)
+        if not self.meets:
+            return
         if self._is_forgotten or self._is_outrun:
             keeps = met.meet(self.thickness, self.mean_edge, self._collides, keeps=not self._is_forgotten)
             for pairs in lists:

@@ -2,14 +2,7 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import (
-    CellArrays,
-    Nodes,
-    Strains,
-    TriangleFrames,
-    TriangleSystem,
-    TriangleWork,
-)
+from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, TriangleSystem, TriangleWork
 from sim.cloth.cells import OWN_SHARE, TRIANGLE
 from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
 from sim.cloth.device_springs import TINY_LENGTH
@@ -18,7 +11,7 @@ from sim.cloth.spring_convergence import LARGEST_RESIDUAL
 from sim.cloth.state import ClothState
 from sim.cloth.threads import STRAIGHTENED, direction_of
 from sim.core.arrays import Floats, Vectors
-from sim.core.bundles import func
+from sim.core.bundles import func, with_room
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, LaneReduction, Results, Share, reduced_tree, runs_on_gpu
 from sim.core.scheduling import is_short
@@ -70,14 +63,13 @@ class TriangleSolver:
     def __init__(self, state: ClothState, cells: DeviceCells) -> None:
         self._state, self.cloths = state, cells.cloths
         count, n = cells.count, state.vertex_count
-
-        def vectors(size: int, length: int = 3) -> ti.Ndarray:
-            array = ti.Vector.ndarray(length, ti.f32, size)
-            array.fill(0.0)
-            return array
-
-        scalars = ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 1)
-        scalars.fill(0.0)
+        work = with_room(
+            TriangleWork,
+            n,
+            scalars=ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 1),
+            moment=ti.Vector.ndarray(4, ti.f32, cells.chunks),
+            shift=ti.Vector.ndarray(3, ti.f32, cells.pieces),
+        )
         self._system = TriangleSystem(
             count,
             cells.own,
@@ -85,17 +77,10 @@ class TriangleSolver:
             cells.pieces,
             cells.on_device,
             cells.mesh,
-            TriangleFrames(*(vectors(count) for _ in range(4)), vectors(count, 4)),
-            TriangleWork(
-                *(vectors(count) for _ in range(2)),
-                *(vectors(size, 2) for size in (count, n)),
-                *(vectors(n) for _ in range(8)),
-                scalars,
-                vectors(cells.chunks, 4),
-                vectors(cells.pieces),
-            ),
+            with_room(TriangleFrames, count),
+            work,
         )
-        self._expected = vectors(n, 2)
+        self._expected = ti.Vector.ndarray(2, ti.f32, n)
         self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
         self._short = is_short(count, TRIANGLE_NS) and is_short(cells.own, NODE_OF_MESH_NS)
         self._left = self._mass = self._least = 0.0
@@ -143,7 +128,7 @@ def stiffer(s: ti.i32, cells: CellArrays, rate: ti.f32) -> ti.f32:
 
 @func
 def strain(s: ti.i32, system: TriangleSystem, moved: Vectors, rate: ti.f32) -> ti.math.vec2:
-    """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `work`."""
+    """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `frames`."""
     d_u = change_of(system.cells.along, system.cells, moved, s)
     d_v = change_of(system.cells.across, system.cells, moved, s)
     n_u, n_v, turning = system.frames.n_u[s], system.frames.n_v[s], system.frames.turning[s]
@@ -154,18 +139,18 @@ def strain(s: ti.i32, system: TriangleSystem, moved: Vectors, rate: ti.f32) -> t
     d_more, d_less = d_u + d_v, d_u - d_v
     s_more = turning[2] * (d_more - more.dot(d_more) * more)
     s_less = turning[3] * (d_less - less.dot(d_less) * less)
-    system.work.s_u[s] = shear * by_u + turning[0] * (d_u - e_u * n_u) + (s_more + s_less)
-    system.work.s_v[s] = shear * by_v + turning[1] * (d_v - e_v * n_v) + (s_more - s_less)
+    system.frames.s_u[s] = shear * by_u + turning[0] * (d_u - e_u * n_u) + (s_more + s_less)
+    system.frames.s_v[s] = shear * by_v + turning[1] * (d_v - e_v * n_v) + (s_more - s_less)
     return ti.math.vec2(e_u, e_v)
 
 
 @func
 def stretch(s: ti.i32, system: TriangleSystem, rate: ti.f32):
-    """Add the forces by e_u and e_v to those in `work`."""
+    """Add the forces by e_u and e_v to those in `frames`."""
     tension = tension_of(s, system.cells, system.mesh, system.mesh.strain, system.mesh.mean)
     tension *= stiffer(s, system.cells, rate)
-    system.work.s_u[s] = system.work.s_u[s] + tension[0] * system.frames.n_u[s]
-    system.work.s_v[s] = system.work.s_v[s] + tension[1] * system.frames.n_v[s]
+    system.frames.s_u[s] = system.frames.s_u[s] + tension[0] * system.frames.n_u[s]
+    system.frames.s_v[s] = system.frames.s_v[s] + tension[1] * system.frames.n_v[s]
 
 
 @func
@@ -184,7 +169,7 @@ def gathered(k: ti.i32, system: TriangleSystem) -> ti.math.vec3:
     for at in range(system.mesh.start[k], system.mesh.start[k + 1]):
         corner = system.mesh.corner[at]
         s = corner // TRIANGLE
-        total += system.cells.along[corner] * system.work.s_u[s] + system.cells.across[corner] * system.work.s_v[s]
+        total += system.cells.along[corner] * system.frames.s_u[s] + system.cells.across[corner] * system.frames.s_v[s]
     return total
 
 
@@ -222,13 +207,7 @@ def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.ve
 
 
 @kernel
-def linearize(
-    system: TriangleSystem,
-    nodes: Nodes,
-    carry: Vectors,
-    dt: ti.f32,
-    is_short: ti.template(),
-):
+def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32, is_short: ti.template()):
     """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
 
     Damping adds tau times the rate at which the prediction strains.
@@ -253,9 +232,9 @@ def linearize(
         system.mesh.strain[s] = e + rate * ti.math.vec2(n_u.dot(moved_u), n_v.dot(moved_v))
         shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v))
         shear *= system.cells.law[s][1]
-        system.work.s_u[s], system.work.s_v[s] = shear * by_u, shear * by_v
+        system.frames.s_u[s], system.frames.s_v[s] = shear * by_u, shear * by_v
         length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
-        system.work.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
+        system.frames.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
         lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
         pull = ROOT_HALF * system.cells.law[s][1] * shear_of(start_u, start_v)[0]
         system.frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
@@ -263,14 +242,14 @@ def linearize(
         ti.loop_config(serialize=True)
     for k in range(system.own):
         system.mesh.mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.mesh.strain)
-        system.work.start_mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.work.start)
+        system.work.start_mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.frames.start)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(system.count):
-        tension = tension_of(s, system.cells, system.mesh, system.work.start, system.work.start_mean)
+        tension = tension_of(s, system.cells, system.mesh, system.frames.start, system.work.start_mean)
         system.frames.turning[s] = ti.max(system.frames.turning[s] * ti.math.vec4(tension, 1.0, 1.0), 0.0)
         stretch(s, system, 0.0)
-        system.work.s_u[s], system.work.s_v[s] = dt * dt * system.work.s_u[s], dt * dt * system.work.s_v[s]
+        system.frames.s_u[s], system.frames.s_v[s] = dt * dt * system.frames.s_u[s], dt * dt * system.frames.s_v[s]
 
 
 @func
@@ -365,14 +344,7 @@ def begin_iteration(
 
 
 @kernel
-def iterate(
-    system: TriangleSystem,
-    nodes: Nodes,
-    dt: ti.f32,
-    first: ti.i32,
-    share: Share,
-    is_short: ti.template(),
-):
+def iterate(system: TriangleSystem, nodes: Nodes, dt: ti.f32, first: ti.i32, share: Share, is_short: ti.template()):
     """`ITERATIONS_AT_ONCE` iterations, from number `first` on: with z = B r, gamma = r.z, delta = z.A z,
 
     beta = gamma/gamma', alpha = gamma/(delta - beta gamma/alpha'), p = z + beta p, q = A z + beta q,
@@ -435,11 +407,7 @@ def measure_displaced(system: TriangleSystem, nodes: Nodes, is_short: ti.templat
 
 @kernel
 def finish_iteration(
-    system: TriangleSystem,
-    nodes: Nodes,
-    elastic: Vectors,
-    expected: Strains,
-    is_short: ti.template(),
+    system: TriangleSystem, nodes: Nodes, elastic: Vectors, expected: Strains, is_short: ti.template()
 ):
     """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
     nodes are expected to have then.
@@ -481,11 +449,7 @@ def finish_iteration(
 
 @kernel
 def measure_node_excess(
-    system: TriangleSystem,
-    nodes: Nodes,
-    expected: Strains,
-    share: Share,
-    is_short: ti.template(),
+    system: TriangleSystem, nodes: Nodes, expected: Strains, share: Share, is_short: ti.template()
 ) -> Results:
     """Largest excess of strain of nodes of triangles, as `spring_convergence` has it, and how many along warp and weft
     are beyond `LARGEST_RESIDUAL`.
