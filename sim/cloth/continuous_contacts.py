@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import NodeSums, PushedNodes
 from sim.cloth.contact_iteration import STEPS
-from sim.cloth.continuous_response import push, weigh
+from sim.cloth.contact_weights import weigh_contacts
+from sim.cloth.continuous_response import push
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
@@ -236,7 +237,7 @@ class ContinuousContacts:
 
     def _begin_push(self, state: ClothState, count: int, *, is_first: bool, short: bool) -> list[int]:
         """A round of the first `STEPS` steps; what `push` returns."""
-        weigh(
+        weigh_contacts(
             count,
             self._contacts.found,
             self._contacts.impulses(self._impulse_unit),

@@ -19,28 +19,11 @@ import taichi as ti
 from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, PushedNodes
 from sim.cloth.contact_answers import relative_displacement, thickness_between
 from sim.cloth.contact_iteration import Momenta, finish_push, push_apart
-from sim.cloth.contact_weights import weigh_contacts
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
 
 TOLERANCE = 0.02
 """Part of their thickness by which contacts may miss what they should keep."""
-
-
-@kernel
-def weigh(
-    count: ti.i32,
-    contacts: Contacts,
-    impulses: Impulses,
-    vertex_count: ti.i32,
-    nodes: PushedNodes,
-    sums: NodeSums,
-    bodies: PushedBodies,
-    is_first: ti.i32,
-    is_short: ti.template(),
-):
-    """Which contacts push in a round (`weigh_contacts`)."""
-    weigh_contacts(count, contacts, impulses, vertex_count, nodes, sums, bodies, is_first, is_short)
 
 
 @kernel
@@ -56,7 +39,7 @@ def push(
     bodies: PushedBodies,
     is_short: ti.template(),
 ) -> ti.math.ivec4:
-    """Some steps of the iteration of a round that was weighed, and where they lead if it `finishes`.
+    """Some steps of the iteration of a round (`weigh_contacts`), and where they lead if it `finishes`.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
     `TOLERANCE` then, and whether any were settled.

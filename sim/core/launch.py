@@ -179,21 +179,24 @@ class FastKernel:
     def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
         """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
         flat = tuple(flattened(args))
-        began = time.perf_counter()
-        program.config().advanced_optimization = not (self._is_large and self._on_cpu)
-        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
-        traced = time.perf_counter()
-        compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-        ended = time.perf_counter()
-        if ended - traced > SLOW_S:
-            for tell in _tell_compiled:
-                tell(self.__name__, ended - began)
-        tasks = None
-        if self._on_cuda:
-            result, tasks = tasks_of(self.__name__, lambda: self._primal(*flat))
-        else:
-            result = self._primal(*flat)
-        program.config().advanced_optimization = True
+        config, tasks = program.config(), None
+        optimizes = config.advanced_optimization
+        config.advanced_optimization = optimizes and not (self._is_large and self._on_cpu)
+        try:
+            began = time.perf_counter()
+            kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
+            traced = time.perf_counter()
+            compiled = program.compile_kernel(config, program.get_device_caps(), kernel)
+            ended = time.perf_counter()
+            if ended - traced > SLOW_S:
+                for tell in _tell_compiled:
+                    tell(self.__name__, ended - began)
+            if self._on_cuda:
+                result, tasks = tasks_of(self.__name__, lambda: self._primal(*flat))
+            else:
+                result = self._primal(*flat)
+        finally:
+            config.advanced_optimization = optimizes
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
             self._sort_arguments()
