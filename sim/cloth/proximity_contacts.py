@@ -2,8 +2,8 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import Contacts, Impulses
-from sim.core.bundles import with_room
+from sim.cloth.bundles import Contacts, Four, Impulses
+from sim.core.bundles import func, with_room
 
 VERTEX_TRIANGLE, EDGE_EDGE, WALL = -1, -2, -3
 """What a contact is between; from 0 on it is the number of the body that the cloth touches."""
@@ -48,6 +48,25 @@ class ContactList:
         uses = {"used_by": ti.ndarray(ti.i32, 4 * self.capacity), "use_weight": ti.ndarray(ti.f32, 4 * self.capacity)}
         self._impulses: Impulses = with_room(Impulses, self.capacity, unit=1.0, **uses)
         self.crossing = ti.ndarray(ti.i32, self.capacity)
+
+
+@func
+def append_contact(
+    contacts: Contacts,
+    vertices: Four,
+    weights: ti.math.vec4,
+    normal: ti.math.vec3,
+    floor: ti.f32,
+    kind: ti.i32,
+    arm: ti.math.vec3,
+    friction: ti.f32,
+):
+    """Append a contact if there is room; it is counted in any case."""
+    slot = ti.atomic_add(contacts.counter[0], 1)
+    if slot < contacts.capacity:
+        contacts.vertices[slot], contacts.weights[slot], contacts.normal[slot] = vertices, weights, normal
+        contacts.floor[slot], contacts.kind[slot] = floor, kind
+        contacts.arm[slot], contacts.friction[slot] = arm, friction
 
 
 @ti.func

@@ -22,7 +22,7 @@ from sim.cloth.bundles import (
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
-from sim.cloth.proximity_contacts import WALL, ContactList, least_displacement
+from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision import Box
 from sim.cloth.self_collision_kernels import lanes_of_pair
@@ -297,13 +297,9 @@ def touch_wall(i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: t
         depth = ti.max(2.0 * WALL_DEPTH * half, walls.spacing, surface.displacement[i].norm())
         is_above = (x >= walls.low[w] - depth * walls.joined_low[w]).all()
         is_below = (x <= walls.high[w] + depth * walls.joined_high[w]).all()
-        slot = contacts.capacity
         if is_above and is_below and distance > -depth:
-            slot = ti.atomic_add(contacts.counter[0], 1)
-        if slot < contacts.capacity:
-            contacts.vertices[slot], contacts.weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)
-            contacts.normal[slot], contacts.floor[slot], contacts.kind[slot] = n, least, WALL
-            contacts.arm[slot], contacts.friction[slot] = ti.math.vec3(0.0), surface.friction[i]
+            weights, nothing = ti.math.vec4(1.0, 0.0, 0.0, 0.0), ti.math.vec3(0.0)
+            append_contact(contacts, Four(i), weights, n, least, WALL, nothing, surface.friction[i])
 
 
 @func
@@ -361,12 +357,8 @@ def touch_body(
             n = unit_or(across @ n, n)
             least = least_displacement(distance, keeps, recovery)
             if distance < keeps or n.dot(relative) < least:
-                slot = ti.atomic_add(contacts.counter[0], 1)
-                if slot < contacts.capacity:
-                    contacts.vertices[slot], contacts.weights[slot] = corners, weight
-                    contacts.normal[slot], contacts.floor[slot] = n, least
-                    contacts.kind[slot], contacts.arm[slot] = b, r
-                    contacts.friction[slot] = ti.sqrt(own_friction * bodies.friction[b])
+                friction = ti.sqrt(own_friction * bodies.friction[b])
+                append_contact(contacts, corners, weight, n, least, b, r, friction)
 
 
 @func
@@ -418,27 +410,26 @@ def find_rigid_contacts(
     share a patch, and workers (`sim.core.scheduling`). Returns the numbers of the list's counter, whose first is 0
     then.
     """
+    vertices, elements = ti.static((patches.vertices, patches.elements))
     lanes, workers_end = work[0], work[1]
     begin_sharing(taken, 0)
     for worker in range(workers_end):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while item < patches.vertices.count * lanes:
+        while item < vertices.count * lanes:
             m = item // lanes
             reach = motion.shift[m].norm() + (1.0 + motion.turn[m].norm()) * motion.radius[m] + motion.rest[m]
             for w in range(walls.count):
                 above = walls.plane[w].xyz.dot(motion.centre[m]) - walls.plane[w].w
                 is_near = above < WITH_ROUNDING * (reach + largest_half)
-                place = ti.select(is_near, patches.vertices.first[m], patches.vertices.first[m + 1]) + item % lanes
-                while place < patches.vertices.first[m + 1]:
-                    touch_wall(patches.vertices.nodes[place], w, surface, walls, recovery, contacts)
+                place = ti.select(is_near, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                while place < vertices.first[m + 1]:
+                    touch_wall(vertices.nodes[place], w, surface, walls, recovery, contacts)
                     place += lanes
             if ti.static(meets != NO_BODIES):
                 may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-                place = (
-                    ti.select(may_touch == 1, patches.vertices.first[m], patches.vertices.first[m + 1]) + item % lanes
-                )
-                while place < patches.vertices.first[m + 1]:
-                    i = patches.vertices.nodes[place]
+                place = ti.select(may_touch == 1, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                while place < vertices.first[m + 1]:
+                    i = vertices.nodes[place]
                     half = 0.5 * surface.thickness[i]
                     for b in range(bodies.count):
                         touch_body(
@@ -461,20 +452,20 @@ def find_rigid_contacts(
         begin_sharing(taken, 1)
         for worker in range(workers_end):
             item = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
-            while item < patches.elements.count * lanes:
+            while item < elements.count * lanes:
                 m = item // lanes
                 may_touch = may_touch_bodies(m, motion, largest_half, bodies)
                 # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
-                edges = patches.elements.first_edge[m + 1] - patches.elements.first_edge[m]
-                end = edges + patches.elements.first_triangle[m + 1] - patches.elements.first_triangle[m]
+                edges = elements.first_edge[m + 1] - elements.first_edge[m]
+                end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
                 place = ti.select(may_touch == 1, item % lanes, end)
                 while place < end:
                     corners = Three(0)
                     if place < edges:
-                        ends = patches.elements.edges[patches.elements.first_edge[m] + place]
+                        ends = elements.edges[elements.first_edge[m] + place]
                         corners = Three(ends[0], ends[1], ends[1])
                     else:
-                        corners = patches.elements.triangles[patches.elements.first_triangle[m] + place - edges]
+                        corners = elements.triangles[elements.first_triangle[m] + place - edges]
                     for b in range(bodies.count):
                         if bodies.shows[b] > ti.cast(place < edges, ti.i32):
                             touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)
