@@ -44,12 +44,14 @@ def push(
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
     `TOLERANCE` then, and whether any were settled.
     """
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
+    measured_end = finishes * pushing_count
     push_apart(momenta, starts, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
     finish_push(finishes, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for place in range(finishes * pushing_count):
+    for place in range(measured_end):
         c = impulses.pushing[place]
         w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
