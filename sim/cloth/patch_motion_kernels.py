@@ -45,6 +45,9 @@ WIDENED = 1.25
 KEPT_MARGIN = 0.97
 """Part of what they may that they keep for the next substep, whatever they did: what they do swings about a mean."""
 
+LARGEST_STILL = 1.0e15
+"""Differences of displacements from which on none are fitted [m]."""
+
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
@@ -145,9 +148,10 @@ def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNode
         x, u = nodes.position[i], nodes.displacement[i]
         least, most = ti.min(least, x), ti.max(most, x)
         u_least, u_most = ti.min(u_least, u), ti.max(u_most, u)
-        r, v = x - origin, u - u_first
-        r_sum, u_sum, moment = r_sum + r, u_sum + v, moment + r.cross(v)
-        squares, products = squares + r * r, products + r * r.yzx
+        if still < LARGEST_STILL:
+            r, v = x - origin, u - u_first
+            r_sum, u_sum, moment = r_sum + r, u_sum + v, moment + r.cross(v)
+            squares, products = squares + r * r, products + r * r.yzx
     patches.low[m], patches.high[m] = least, most
     x_0, u_0, w = 0.5 * (least + most), 0.5 * (u_least + u_most), ti.math.vec3(0.0)
     left, largest = (0.5 * (u_most - u_least)).norm_sqr(), (0.5 * (most - least)).norm_sqr()

@@ -27,6 +27,7 @@ from sim.cloth.bundles import (
 from sim.cloth.contact_end import end_contacts
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_motion_kernels import (
+    LARGEST_STILL,
     look_at_patches,
     merge_boxes,
     pair_patches,
@@ -59,9 +60,6 @@ MARGIN = 0.5
 STILL = 1.0e-3
 """Part of the thickness by which displacements of a patch may differ without a turn being fitted to them: a list lasts
 for a hundred substeps even so, and cloth that falls or lies is looked at once instead of twice."""
-
-LARGEST_STILL = 1.0e15
-"""By which displacements may differ where no turns are fitted [m]."""
 
 TOO_MANY = f"more than {MAX_PAIRS} pairs of cloth elements are near each other; lower the step"
 
@@ -178,7 +176,7 @@ class PatchPairs:
         self._counters: Counters = with_room(Counters, 3)
         self._first_known = ti.ndarray(ti.i32, 2 * max(m, 1))
         self._maxima = LaneReduction(maxima=7, sums=0)
-        self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
+        self._astray, self._half_thickness, self._still, self._fits = 0.0, 0.0, 0.0, True
         self.due_count = self.expired_count = 0
         self._is_short = is_short(patches.vertex_count, NODE_NS)
         self._needed = ti.ndarray(ti.i32, max(m, 1))
@@ -201,8 +199,10 @@ class PatchPairs:
     def set_margin(self, thickness: float, *, fits: bool = True) -> None:
         """Allow contacts to displace vertices by half a thickness [m], whatever they did before.
 
-        Turns are fitted to patches only if what `fits` is of use, as for pairs of them: bodies do with their boxes.
+        Without pairs of patches nothing `fits`: bodies do with boxes of patches and of their displacements, and
+        vertices are neither tested nor followed.
         """
+        self._fits = fits
         self._half_thickness, self._still = 0.5 * thickness, STILL * thickness if fits else LARGEST_STILL
         self._budget.margin.fill(MARGIN * thickness)
         self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
@@ -288,7 +288,8 @@ class PatchPairs:
 
     def _look(self, state: ClothState, vertex_count: int, ageing: Ageing | None) -> tuple[float, bool]:
         """Look at the patches unless there are no vertices, then age the pairs unless nothing is said about that."""
-        patches = self.patches
+        patches, looks_at_patches = self.patches, vertex_count > 0
+        vertex_count = vertex_count if self._fits else 0
         motion, astray, expired, due = look_at_patches(
             vertex_count,
             self._tracked(state),
@@ -298,7 +299,7 @@ class PatchPairs:
             self._moving,
             self.on_device,
             ageing or Ageing(0.0, 0.0, self.on_device.left, self.on_device.left),
-            (workers_for(patches.count) if vertex_count else 0, workers_for(self.count) if ageing else 0),
+            (workers_for(patches.count) if looks_at_patches else 0, workers_for(self.count) if ageing else 0),
             self._counters,
             self._is_short,
         )
@@ -332,10 +333,10 @@ class PatchPairs:
         """
         patches, half = self.patches, self._half_thickness
         found: list[int] = end_contacts(
-            count,
+            count if self._fits else 0,
             contacts.found,
             TestedContacts(contacts.impulses().impulse, state.inverse_mass, state.thickness, contacts.crossing),
-            patches.vertex_count,
+            patches.vertex_count if self._fits else 0,
             self._tracked(state),
             predicted,
             self._moving,

@@ -89,7 +89,7 @@ class SelfCollision:
 
         Lists are kept, unless thicknesses or flags have changed: no result depends on when they were made.
         """
-        self._searched = 0
+        self._searched, self._was_changed = 0, False
         thickness = copied(state.thickness)  # of each node, as pairs are listed with the distance that they keep
         listed_for = thickness.tobytes(), state.self_collision
         if listed_for != self._listed_for:
@@ -106,11 +106,14 @@ class SelfCollision:
         return self._searched / max(self._patches.count, 1)
 
     def look(self, state: ClothState) -> float:
-        """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
+        """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m].
+
+        0 where none may meet: that is asked of pairs alone.
+        """
         is_aged = self.meets and not (self._is_forgotten or self._is_outrun)
         motion, holds = self._met.look(state, self._ageing if is_aged else None)
         self._is_outrun |= not holds
-        return motion
+        return motion if self.meets else 0.0
 
     @property
     def _ageing(self) -> Ageing:
@@ -129,7 +132,9 @@ class SelfCollision:
         self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
     ) -> list[int]:
         """See `PatchPairs.finish`."""
-        negligible = NEGLIGIBLE * self.thickness
+        if not (self.meets or is_changed or self._was_changed):
+            return [0, 0, 0]
+        self._was_changed, negligible = is_changed, NEGLIGIBLE * self.thickness
         return self._met.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:

@@ -295,7 +295,7 @@ def test_wind_straight_onto_a_slanting_sheet_pushes_it_straight_and_alike_everyw
     normal = np.cross(x[0, 1] - x[0, 0], x[0, 2] - x[0, 0])
     normal /= np.linalg.norm(normal)
     solver.change("sheet", wind=tuple(100.0 * normal))
-    solver.air.predict(range(1), ti.math.vec3(WEIGHTLESS), 1.0 / 1200.0)
+    solver.air.predict(ti.math.vec3(WEIGHTLESS), 1.0 / 1200.0)
     force = solver.air.force.to_numpy().astype(np.float64)
     along = force @ normal
     np.testing.assert_allclose(force - along[:, None] * normal, 0.0, atol=1e-4 * along.max())
