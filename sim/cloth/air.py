@@ -6,12 +6,15 @@ import numpy as np
 import taichi as ti
 
 from sim.cloth.bundles import Air, NodeMotion, Nodes
+from sim.cloth.loop_costs import NODE_IN_AIR_NS
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
-from sim.core.arrays import Vectors
+from sim.core.arrays import Vectors, on_device
+from sim.core.bundles import with_room
 from sim.core.launch import kernel
 from sim.core.parameters import KeyRefusedError, Vector3
+from sim.core.scheduling import is_short
 
 WIND = -1
 """Source of air that is nothing but the wind of a cloth's parameters."""
@@ -30,8 +33,8 @@ class ClothAir:
         inverse_mass: area of cloth over the mass of the air that it acts on [m²/kg], (k,); 0 for wind.
         source: number of what the air belongs to, (k,) int32; `WIND` for wind.
         density: of the air [kg/m³], (k,); 0 where it drags nothing.
-        force: of the air on each triangle in the last substep [N], (k,) vec3; of those that `predict` was called for.
-        impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3; of those, too.
+        force: of the air on each triangle in the last substep [N], (k,) vec3.
+        impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3.
         wind: of the parameters [m/s], (k,) vec3.
         share: of each node in the force on any of its triangles [-], (n,).
         triangle_start: the triangles of node i are `triangle_list[triangle_start[i]:triangle_start[i + 1]]`.
@@ -48,32 +51,18 @@ class ClothAir:
         """
         host, count = state.host, state.triangle_count
         self._state = state
-        self.velocity, self.force, self.impulse, self._drag = (ti.Vector.ndarray(3, ti.f32, count) for _ in range(4))
-        self.inverse_mass, self.density = (ti.ndarray(ti.f32, count) for _ in range(2))
-        self.source = ti.ndarray(ti.i32, count)
-        self.source.fill(WIND)
+        self.source, self.density = on_device(np.full(count, WIND)), ti.ndarray(ti.f32, count)
         self.wind = ti.Vector.ndarray(3, ti.f32, count)
         self.acts = self.is_shared = False
+        self._is_short = is_short(state.vertex_count, NODE_IN_AIR_NS)
         triangles = host.triangles
         order = np.argsort(triangles.ravel(), kind="stable")
         start = np.searchsorted(triangles.ravel()[order], np.arange(state.vertex_count + 1))
-        self.triangle_start = ti.ndarray(ti.i32, len(start))
-        self.triangle_start.from_numpy(start.astype(np.int32))
-        self.triangle_list = ti.ndarray(ti.i32, len(order))
-        self.triangle_list.from_numpy((order // 3).astype(np.int32))
         around = np.bincount(triangles.ravel(), weights=np.repeat(triangle_areas(host.position, triangles), 3))
-        self.share = ti.ndarray(ti.f32, state.vertex_count)
-        self.share.from_numpy((host.node_area / around).astype(np.float32))
-        self._on_device = Air(
-            self.velocity,
-            self.inverse_mass,
-            self._drag,
-            self.share,
-            self.force,
-            self.impulse,
-            self.triangle_start,
-            self.triangle_list,
-        )
+        of_nodes = [on_device(each) for each in (host.node_area / around, start, order // 3)]
+        self.share, self.triangle_start, self.triangle_list = of_nodes
+        self._on_device: Air = with_room(Air, count, **dict(zip(Air._fields[-3:], of_nodes, strict=True)))
+        self.velocity, self.inverse_mass, self._drag, self.force, self.impulse, *_ = self._on_device
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
         """Drag and wind as the parameters have them now; air that a coupling put there stays.
@@ -101,23 +90,21 @@ class ClothAir:
         self.velocity.from_numpy(np.where(is_wind[:, None], wind_of, self.velocity.to_numpy()))
         self.acts = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
 
-    def predict(self, cloths: range, gravity: Vector3, dt: float) -> None:
-        """Accelerate some cloths by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
+    def predict(self, gravity: Vector3, dt: float) -> None:
+        """Accelerate the nodes by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
         state = self._state
-        triangles, nodes = (
-            (int(firsts[cloths.start]), int(firsts[cloths.stop]))
-            for firsts in (state.host.first_triangle, state.host.first_node)
-        )
+        count = state.triangle_count if self.acts else 0
         predict_in_air(
             state.position,
             state.triangles,
-            *(triangles if self.acts else (0, 0)),
+            count,
             self._on_device,
             state.nodes,
             state.motion,
-            *nodes,
+            state.vertex_count,
             gravity,
             dt,
+            self._is_short,
         )
 
 
@@ -153,20 +140,18 @@ def drag_along(
 def predict_in_air(
     position: Vectors,
     triangles: Triangles,
-    first_triangle: ti.i32,
-    end_triangle: ti.i32,
+    triangle_count: ti.i32,
     air: Air,
     nodes: Nodes,
     motion: NodeMotion,
-    first: ti.i32,
-    end: ti.i32,
+    count: ti.i32,
     gravity: ti.math.vec3,
     dt: ti.f32,
+    is_short: ti.template(),
 ):
     """Accelerate nodes by gravity and by their share of the force on each of their triangles; where that leads in dt.
 
-    Of no triangles, if the air does not act, there is no force. Nodes and triangles are those from the first to before
-    the end.
+    Of no triangles, if the air does not act, there is no force.
 
     The force of the air on each triangle [N] is normal and tangential, quadratic in the speed of the air past it:
 
@@ -180,8 +165,9 @@ def predict_in_air(
     with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
     not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
     """
-    first_node, end_node = first, end  # before the first loop: found between two, they would be a launch of their own
-    for t in range(first_triangle, end_triangle):
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for t in range(triangle_count):
         a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
         x_a = position[a]
         cross = (position[b] - x_a).cross(position[c] - x_a)
@@ -214,11 +200,13 @@ def predict_in_air(
             force *= area
             air.impulse[t] = air.impulse[t] + dt * force  # += is an atomic operation
         air.force[t] = force
-    for i in range(first_node, end_node):
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for i in range(count):
         w_i = nodes.inverse_mass[i]
         if w_i > 0.0:
             v_i = motion.velocity[i] + dt * gravity
-            if end_triangle > first_triangle:
+            if triangle_count > 0:
                 force = ti.math.vec3(0.0)
                 for k in range(air.triangle_start[i], air.triangle_start[i + 1]):
                     force += air.force[air.triangle_list[k]]

@@ -7,6 +7,7 @@ from sim.cloth.bundles import NodeMotion, Nodes
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.state import ClothState
 from sim.core.arrays import Vectors
+from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, Share, Tree, device_lanes, reduced, runs_on_gpu
 from sim.core.scheduling import is_short
@@ -58,6 +59,13 @@ class AngularMomentumCorrection:
         self._is_warm = True
 
 
+@func
+def three(tree: Tree, first: ti.i32) -> ti.math.vec3:
+    """Three totals, from one on."""
+    step = tree.lanes // BRANCHES
+    return ti.math.vec3(tree.nodes[first * step], tree.nodes[(first + 1) * step], tree.nodes[(first + 2) * step])
+
+
 @kernel
 def return_angular_momentum(
     nodes: Nodes,
@@ -73,9 +81,10 @@ def return_angular_momentum(
 
     Moments are about the first node; `turn` becomes the rotation, and the centre of mass from there.
     """
+    (tree,) = ti.static((share.tree,))
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
+    for lane in range(tree.lanes):
         mass = 0.0
         moment = ti.math.vec3(0.0)
         squares = ti.math.vec3(0.0)
@@ -91,28 +100,20 @@ def return_angular_momentum(
                 mass += m_i
                 moment += m_i * r_i
                 squares += m_i * r_i * r_i
-                products += m_i * ti.math.vec3(r_i.y * r_i.z, r_i.z * r_i.x, r_i.x * r_i.y)
+                products += m_i * r_i.yzx * r_i.zxy
                 spin += m_i * r_i.cross(e_i)
-        share.tree.partial[lane] = mass
-        for axis in ti.static(range(3)):
-            share.tree.partial[(1 + axis) * share.tree.lanes + lane] = moment[axis]
-            share.tree.partial[(4 + axis) * share.tree.lanes + lane] = squares[axis]
-            share.tree.partial[(7 + axis) * share.tree.lanes + lane] = products[axis]
-            share.tree.partial[(10 + axis) * share.tree.lanes + lane] = spin[axis]
-    reduced(share.tree.partial, share.tree.lanes, QUANTITIES, 0, share.tree.nodes)
+        tree.partial[lane] = mass
+        for first_of, vector in ti.static(((1, moment), (4, squares), (7, products), (10, spin))):
+            for axis in ti.static(range(3)):
+                tree.partial[(first_of + axis) * tree.lanes + lane] = vector[axis]
+    reduced(tree.partial, tree.lanes, QUANTITIES, 0, tree.nodes)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for _ in range(1):
-        step = share.tree.lanes // BRANCHES
-        mass = share.tree.nodes[0]
-        centre = ti.math.vec3(share.tree.nodes[step], share.tree.nodes[2 * step], share.tree.nodes[3 * step]) / mass
-        squares = (
-            ti.math.vec3(share.tree.nodes[4 * step], share.tree.nodes[5 * step], share.tree.nodes[6 * step])
-            - mass * centre * centre
-        )
-        products = ti.math.vec3(share.tree.nodes[7 * step], share.tree.nodes[8 * step], share.tree.nodes[9 * step])
-        products -= mass * ti.math.vec3(centre.y * centre.z, centre.z * centre.x, centre.x * centre.y)
-        spin = ti.math.vec3(share.tree.nodes[10 * step], share.tree.nodes[11 * step], share.tree.nodes[12 * step])
+        mass = tree.nodes[0]
+        centre, spin = three(tree, 1) / mass, three(tree, 10)
+        squares = three(tree, 4) - mass * centre * centre
+        products = three(tree, 7) - mass * centre.yzx * centre.zxy
         whole = squares.sum()
         least = LEAST_INERTIA * whole
         inertia = ti.Matrix(

@@ -101,24 +101,24 @@ class MeshNodes(NamedTuple):
 
 @bundle
 class TriangleFrames(NamedTuple):
-    """Along which triangles push in a step, (s,) each."""
+    """Along which triangles push in a step, and by how much, (s,) each."""
 
     n_u: Vectors  # direction of the warp
     n_v: Vectors
     by_u: Vectors  # derivatives of the shear
     by_v: Vectors
     turning: Weights  # tension over length that turns with warp, weft, their sum and difference [J]
+    s_u: Vectors  # forces along d_u and d_v [J]
+    s_v: Vectors
+    start: Strains  # e_u and e_v at the start of the step
 
 
 @bundle
 class TriangleWork(NamedTuple):
-    """Numbers of conjugate gradients, (s,) and (n,)."""
+    """Numbers of conjugate gradients, (n,) each."""
 
-    s_u: Vectors  # forces along d_u and d_v [J], (s,)
-    s_v: Vectors
-    start: Strains  # e_u and e_v at the start of the step, (s,)
-    start_mean: Strains  # (n,)
-    x: Vectors  # solution [m], (n,)
+    start_mean: Strains  # e_u and e_v at the start of the step
+    x: Vectors  # solution [m]
     r: Vectors  # residual [kg m]
     z: Vectors  # preconditioned residual [m]
     a_z: Vectors  # matrix times that [kg m]
@@ -179,9 +179,9 @@ class Air(NamedTuple):
     velocity: Vectors  # [m/s], (k,)
     inverse_mass: Floats  # area of cloth over mass of air [m²/kg], (k,)
     drag: Vectors  # rho C_n / 2, rho C_t / 2 [kg/m³], mass of the triangle [kg], (k,)
-    share: Floats  # of each node in the force on its triangles [-], (n,)
     force: Vectors  # [N], (k,)
     impulse: Vectors  # [N s], (k,)
+    share: Floats  # of each node in the force on its triangles [-], (n,)
     triangle_start: Integers  # of each node in the list, (n + 1,)
     triangle_list: Integers
 
@@ -190,35 +190,18 @@ class Air(NamedTuple):
 
 
 @bundle
-class Rectangle(NamedTuple):
-    """A rectangle of nodes in rows."""
-
-    first: ti.i32  # number of its first node
-    columns: ti.i32
-    rows: ti.i32
-    strips: ti.i32  # upright blocks beside each other
-    turned_strips: ti.i32
-
-
-@bundle
 class Lines(NamedTuple):
     """Lines of a rectangle along one direction."""
 
     count: ti.i32
-    is_turned: ti.i32  # whether they run along x
     length: ti.i32  # nodes of a line
+    first: ti.i32  # block; 0 of upright ones
     strips: ti.i32  # blocks beside each other
-    other_strips: ti.i32  # those of the other direction
-
-
-@bundle
-class Wind(NamedTuple):
-    """Wind on a rectangle."""
-
-    velocity: ti.math.vec3  # [m/s]
-    drag: ti.f32  # rho C_n / 2 [kg/m³]
-    skin_drag: ti.f32  # rho C_t / 2 [kg/m³]
-    mass: ti.f32  # of a triangle [kg]
+    other_first: ti.i32  # those of the other direction
+    other_strips: ti.i32
+    first_node: ti.i32
+    line_step: ti.i32  # from a node to the same of the next line
+    node_step: ti.i32  # from a node to the next one of its line
 
 
 # --- patches --------------------------------------------------------------------------------------------------------
@@ -344,19 +327,19 @@ class KnownPairs(NamedTuple):
 
 @bundle
 class PatchPairArrays(NamedTuple):
-    """Pairs of patches; fields as the attributes of `PatchPairs`, (p,) each."""
+    """Pairs of patches, (p,) each."""
 
     count: ti.i32  # p
-    pairs: Pairs
-    slack: Floats  # [m]
+    pairs: Pairs  # numbers of the patches, the smaller first
+    slack: Floats  # how much nearer elements may come that are not listed [m]
     wake: Floats  # what the patches of a sleeping pair spend until it wakes [m], or -1
-    left: Floats  # [m]
-    approach: Floats  # [m]
-    allowed: Floats  # [m]
-    reach: Floats  # [m]
-    due: Integers
-    expired: Integers
-    needed: Integers  # of patches, (m,)
+    left: Floats  # how much of `slack` those that are listed may use up until they are due [m]
+    approach: Floats  # how much nearer points come at most in this substep [m]
+    allowed: Floats  # how much contacts may add to that [m]
+    reach: Floats  # how far to search for elements [m]
+    due: Integers  # numbers of the pairs of which elements have to be looked at
+    expired: Integers  # numbers of those that have to be searched
+    needed: Integers  # 1 for their patches, (m,)
 
 
 @bundle
@@ -382,14 +365,14 @@ class Counters(NamedTuple):
 
 @bundle
 class PairPieces(NamedTuple):
-    """A list of pairs of elements, in pieces; fields as the attributes of `PairList`."""
+    """A list of pairs of elements, in pieces, one of each of p pairs of patches; see `PairList`."""
 
-    pieces: Quadruples  # first place, places, places taken, (p,)
-    piece_due: Floats  # [m], (p,)
-    pairs: Quadruples
-    wanted: Floats  # [m]
-    due: Floats  # [m]
-    again: Integers  # numbers of pieces that are searched again, (p,)
+    pieces: Quadruples  # first place, places, and how many of them are taken, (p,)
+    piece_due: Floats  # the largest `due` of each piece [m], `NEVER` where nothing is listed, (p,)
+    again: Integers  # numbers of the pieces that were too short, and are searched again, (p,)
+    pairs: Quadruples  # a vertex and a triangle's corners, or the ends of two edges
+    wanted: Floats  # distance that they keep [m]; `UNKNOWN` until they have come so near that it matters
+    due: Floats  # they are looked at when `PatchPairArrays.left` is not above it [m]
 
 
 @bundle
@@ -443,15 +426,15 @@ class PatchBlocks(NamedTuple):
 
 @bundle
 class Contacts(NamedTuple):
-    """Contacts as they are found; fields as the attributes of `ContactList`, (c,) each."""
+    """Contacts as they are found, (c,) each; see `ContactList`."""
 
-    vertices: Quadruples
-    weights: Weights
-    normal: Vectors
-    floor: Floats  # [m]
-    kind: Integers
-    arm: Vectors  # [m]
-    friction: Floats  # [-]
+    vertices: Quadruples  # up to four; of a vertex and a triangle in this order, of two edges in turn
+    weights: Weights  # signed; 0 of vertices that do not count
+    normal: Vectors  # unit vector from the second to the first, or out of the body
+    floor: Floats  # least relative displacement along the normal [m], or `INACTIVE`
+    kind: Integers  # `VERTEX_TRIANGLE`, `EDGE_EDGE`, `WALL`, or the number of a body
+    arm: Vectors  # from the body's centre of mass to the point [m]
+    friction: Floats  # Coulomb's coefficient [-]
     counter: Integers  # (3,)
     capacity: ti.i32
 
@@ -468,16 +451,16 @@ class TestedContacts(NamedTuple):
 
 @bundle
 class Impulses(NamedTuple):
-    """Impulses of contacts; fields as the attributes of `ContactList`."""
+    """Impulses of contacts, (c,) each."""
 
-    mobility: Floats  # [1/kg], (c,)
-    impulse: Vectors  # [kg m], (c,)
-    impulse_before: Vectors
-    impulse_given: Vectors
-    pushing: Integers  # (c,)
-    push: Vectors  # in units, (c,)
-    used_by: Integers  # (4 c,)
-    use_weight: Floats  # (4 c,)
+    mobility: Floats  # what w grows by per impulse, all contacts pushing alike [1/kg]
+    impulse: Vectors  # on the first, minus that on the second, times the step [kg m]
+    impulse_before: Vectors  # an iteration earlier
+    impulse_given: Vectors  # that displacements contain already
+    pushing: Integers  # numbers of the contacts that push
+    push: Vectors  # what they give in a step of the iteration, in units, in the same order
+    used_by: Integers  # places of contacts in that order, node by node, (4 c,)
+    use_weight: Floats  # their weights, (4 c,)
     unit: ti.f32  # of sums of impulses [kg m]
 
 
@@ -508,37 +491,37 @@ class NodeSums(NamedTuple):
 
 @bundle
 class PushedBodies(NamedTuple):
-    """Bodies as contacts push them; fields as the attributes of `CollisionBodies`."""
+    """Bodies as contacts push them, (b,) each."""
 
-    may_move: ti.i32
+    may_move: ti.i32  # whether forces move any of them, or ever did
     count: ti.i32  # b
-    motion: Vectors  # [m] and [rad] in turn, (2 b,)
-    motion_start: Vectors
-    motion_reached: Vectors
-    inverse_mass: Floats  # [1/kg], (b,)
-    inverse_inertia: Matrices  # [1/(kg m²)], (b,)
-    gathered: LongIntegers  # (6 b,)
-    impulse: LongIntegers  # (6 b,)
-    load: LongIntegers  # (b,)
+    motion: Vectors  # displacement of the centre of mass [m] and rotation vector [rad] of each in turn, (2 b,)
+    motion_start: Vectors  # at the start of an iteration
+    motion_reached: Vectors  # in its course
+    inverse_mass: Floats  # [1/kg]; 0 for all that no force moves
+    inverse_inertia: Matrices  # in world axes [1/(kg m²)]
+    gathered: LongIntegers  # linear and angular impulse times the step, in units, (6 b,)
+    impulse: LongIntegers
+    load: LongIntegers  # sums over the contacts of a body, in `load_unit`s
     load_unit: ti.f32  # [kg^(-1/2)]
 
 
 @bundle
 class CollidingBodies(NamedTuple):
-    """Bodies as cloth looks for them; fields as the attributes of `CollisionBodies`, (b,) each."""
+    """Bodies as cloth looks for them, (b,) each."""
 
     count: ti.i32  # b
     shapes: Shapes
-    shows: Integers
-    depth: Floats  # in thicknesses
+    shows: Integers  # whether it may show between vertices, so that triangles are looked at; 2 if edges are, too
+    depth: Floats  # how deep free cloth was in it at most since the frame began, in thicknesses
     centre_of_mass: Vectors  # [m]
     radius: Floats  # [m]
     step: Floats  # [m]
     friction: Floats  # [-]
-    lift: Floats  # [m]
-    position: Vectors  # [m]
-    rotation: Matrices
-    motion: Vectors  # [m] and [rad] in turn, (2 b,)
+    lift: Floats  # how much farther than half a thickness vertices keep [m]
+    position: Vectors  # centre of mass at the start of the substep [m]
+    rotation: Matrices  # body axes to world axes
+    motion: Vectors  # as of `PushedBodies`
 
 
 @bundle

@@ -57,6 +57,11 @@ class Cells:
         """Nodes of each cell."""
         return int(self.nodes.shape[1])
 
+    @property
+    def family(self) -> tuple[int]:
+        """Cells are solved in the order of this, those that share it together."""
+        return (self.arity,)
+
     def law(self, cloth: ClothParameters) -> Floats:
         """Of each cell in a cloth: area times C and G [J], nu [-], damping over stiffness [s], (m, 4)."""
         sheet = cloth.plane_stiffness if self.arity == TRIANGLE else 0.0
@@ -70,32 +75,6 @@ class Cells:
             ],
             axis=1,
         )
-
-    def strains(self, positions: Floats) -> Floats:
-        """e_u, e_v and e_s of each cell [-], (m, 3), with nodes at positions [m], (n, 3)."""
-        u, v = (np.einsum("ma,mai->mi", c, positions[self.nodes]) for c in (self.along, self.across))
-        length = [np.linalg.norm(d, axis=1) for d in (u, v, u + v, u - v)]
-        return np.stack([length[0] - 1.0, length[1] - 1.0, (length[2] - length[3]) * np.sqrt(0.5)], axis=1)
-
-    def energies(self, positions: Floats, law: Floats) -> Floats:
-        """Of each cell [J], (m,), with nodes at positions [m], (n, 3)."""
-        strains, (stretch, shear, poisson, _) = self.strains(positions), law.T
-        energy: Floats = 0.5 * shear * strains[:, 2] ** 2
-        if self.arity == TRIANGLE:
-            means = self.at_corners(strains[:, :2], law)
-            for of_area, of_stretch in ((OWN_SHARE, strains[:, None, :2]), (1.0 - OWN_SHARE, means)):
-                u, v = of_stretch[..., 0], of_stretch[..., 1]
-                energy += of_area * 0.5 * stretch * (u * u + v * v + 2.0 * poisson[:, None] * u * v).mean(axis=1).T
-        return energy
-
-    def at_corners(self, strains: Floats, law: Floats) -> Floats:
-        """Means at the nodes of strains e_u and e_v, (m, 2), for each corner of a cell in its axes, (m, arity, 2)."""
-        turned = np.where(self.swapped[..., None], strains[:, None, ::-1], strains[:, None])
-        nodes, weight = self.nodes.ravel(), np.repeat(law[:, 0], self.arity)
-        u, v = (np.bincount(nodes, weights=weight * turned[..., axis].ravel()) for axis in (0, 1))
-        total = np.maximum(np.bincount(nodes, weights=weight), np.finfo(float).tiny)
-        means = np.stack([u / total, v / total], axis=1)[self.nodes]
-        return np.where(self.swapped[..., None], means[..., ::-1], means)
 
 
 TRIANGLE, RECTANGLE = 3, 4

@@ -6,7 +6,6 @@ from sim.cloth.bundles import (
     Contacts,
     Counters,
     MovingPatches,
-    PatchNodes,
     PatchPairArrays,
     SubstepEnd,
     TestedContacts,
@@ -18,15 +17,14 @@ from sim.cloth.patch_motion_kernels import (
     PATCHES_AT_A_TIME,
     finish_pair,
     finish_patch,
-    margin_after,
     measure_change,
 )
-from sim.core.arrays import Floats, Integers, Vectors
-from sim.core.launch import kernel
+from sim.core.arrays import Vectors
+from sim.core.launch import large_kernel
 from sim.core.scheduling import begin_sharing, next_item
 
 
-@kernel
+@large_kernel
 def end_contacts(
     count: ti.i32,
     contacts: Contacts,
@@ -117,37 +115,3 @@ def end_contacts(
             finish_pair(p, met, patches, end.negligible)
             p = next_item(p, worker, counters.taken, 2, PAIRS_AT_A_TIME)
     return ti.math.ivec3(counters.found[0], counters.found[1], counters.found[2])
-
-
-@kernel
-def end_lone_contacts(
-    corners: PatchNodes,
-    displacement: Vectors,
-    predicted: Vectors,
-    is_changed: ti.i32,
-    least: ti.f32,
-    change: Floats,
-    margin: Floats,
-    more: Floats,
-    counter: Integers,
-    workers: ti.i32,
-    taken: Integers,
-    is_short: ti.template(),
-) -> ti.math.ivec3:
-    """The same of cloth that meets no cloth: margins for the next substep are all that follows from this one."""
-    workers_end, patches_end = workers, corners.count
-    counter[0], counter[1], counter[2] = 0, 0, 0
-    begin_sharing(taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for worker in range(workers_end):
-        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while m < corners.count:
-            measure_change(m, corners, displacement, predicted, 0.0, change, margin, more, counter)
-            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for m in range(patches_end):
-        if counter[1] + counter[2] == 0:
-            margin[m] = margin_after(is_changed, change[m], margin[m], least)
-    return ti.math.ivec3(counter[0], counter[1], counter[2])

@@ -7,6 +7,7 @@ from sim.cloth.contact_answers import answered, body_mobility, give_body
 from sim.cloth.contact_supports import SHARES_PER_UNIT, answer_of, hold, support_between, turned_to_support
 from sim.cloth.proximity_contacts import INACTIVE, WALL
 from sim.core.bundles import func
+from sim.core.launch import kernel
 
 LEAST_FREE_WEIGHT = 0.05
 """A contact pushes only if its vertices that no pin holds have so much of its weight, so that none moves more than
@@ -16,7 +17,7 @@ ALONE = -1
 """In the place of the first use of a vertex: what stands touches it, and nothing else does."""
 
 
-@func
+@kernel
 def weigh_contacts(
     count: ti.i32,
     contacts: Contacts,

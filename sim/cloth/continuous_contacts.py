@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import NodeSums, PatchMotion, PushedNodes
+from sim.cloth.bundles import NodeSums, PushedNodes
 from sim.cloth.contact_iteration import STEPS
-from sim.cloth.continuous_response import begin_push, push_on
-from sim.cloth.lone_cloth import LoneCloth
+from sim.cloth.contact_weights import weigh_contacts
+from sim.cloth.continuous_response import push
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
+from sim.core.bundles import with_room
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short
@@ -56,39 +57,6 @@ IMPULSE_UNIT = 1.0e-5
 steps are; 64 bits hold the sum of ten million vertices stopped from 100 m/s in a step of 0.1 ms."""
 
 
-class NearCloth(Protocol):
-    """Finds what of the cloths is near other cloth, and tells bodies and walls where to look for it."""
-
-    thickness: float
-    """The largest [m]."""
-
-    @property
-    def motion(self) -> PatchMotion:
-        """Of the patches in the substep."""
-
-    def begin_frame(self, state: ClothState) -> None:
-        """Expect of contacts what a run does that continues here."""
-
-    def look(self, state: ClothState) -> float:
-        """Note how cloth moves in this substep; returns a bound [m], which is not finite or huge after a blow-up."""
-
-    def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
-        """After `look`: append the pairs that are too near; `recovery` is the share of a missing distance that comes
-        back [-]."""
-
-    def make_room_for(self, ends: Sequence[int]) -> bool:
-        """Whether lists were too short for what `find` searched, so that it has to go on; now there is room."""
-
-    def finish(
-        self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
-    ) -> Sequence[int]:
-        """Test so many contacts; if none of their pairs may have crossed, the substep is over.
-
-        Returns how many may have; whether contacts, if displacements are `changed` by them, displaced vertices farther
-        than allowed for, so that it is not over either; and whether any displacement is not finite.
-        """
-
-
 class ContinuousContacts:
     """Contacts of all cloths of a scene; implements `sim.cloth.solver.ClothContacts`.
 
@@ -112,33 +80,23 @@ class ContinuousContacts:
         self.rigid = rigid or RigidContact((), (), ())
         self._pairs = SelfCollision(state)
         self._patches = self._pairs.patches
-        self._lone = LoneCloth(state, self._patches)
         self.rigid.set_spacing(self._pairs.coarsest_edge, self._pairs.longest_edge)
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
-        self._pushed = PushedNodes(
+        self._pushed: PushedNodes = with_room(
+            PushedNodes,
+            n,
             displacement=state.displacement,
             inverse_mass=state.inverse_mass,
-            start=ti.Vector.ndarray(3, ti.f32, n),
-            reached=ti.Vector.ndarray(3, ti.f32, n),
-            touched=ti.ndarray(ti.i32, n),
             uses=ti.ndarray(ti.i32, 2 * n),
-            support=ti.Vector.ndarray(3, ti.f32, n),
         )
-        self._pushed.support.fill(0.0)
-        self._sums = NodeSums(
-            counter=ti.ndarray(ti.i32, 5),
-            predicted=ti.Vector.ndarray(3, ti.f32, n),
-            shares=ti.ndarray(ti.i32, n),
-            held_sums=ti.ndarray(ti.i32, 6 * n),
-            lever=ti.ndarray(ti.f32, n),
-            pressing_body=ti.ndarray(ti.i32, n),
+        self._sums: NodeSums = with_room(
+            NodeSums, n, counter=ti.ndarray(ti.i32, 5), held_sums=ti.ndarray(ti.i32, 6 * n)
         )
         self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
-        self._meets_cloth, self._is_warm = False, False
-        self._near: NearCloth = self._lone
+        self._is_warm = False
         self.begin_frame()
 
     # --- what the solver asks ---------------------------------------------------------------------------------------
@@ -151,7 +109,7 @@ class ContinuousContacts:
             state,
             range(n),
             velocity,
-            at_most=self._little_motion(velocity, at_most) if self._meets_cloth else at_most,
+            at_most=self._little_motion(velocity, at_most) if self._pairs.meets else at_most,
         )
         if shortest == at_most or len(state.names) == 1:
             return shortest
@@ -182,11 +140,8 @@ class ContinuousContacts:
     def begin_frame(self) -> None:
         """Count anew, and expect of contacts what a run does that continues here."""
         state = self._state
-        self._meets_cloth = len(state.names) > 1 or any(state.self_collision)
-        # Pairs that have not followed the cloth for a while find, as they look, how far it is from where they left it.
-        self._near = self._pairs if self._meets_cloth else self._lone
-        self._near.begin_frame(state)
-        self.rigid.set_thickness(float(copied(state.thickness).min()), self._near.thickness)
+        self._pairs.begin_frame(state)
+        self.rigid.set_thickness(float(copied(state.thickness).min()), self._pairs.thickness)
         self.rigid.bodies.begin_frame()
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
@@ -211,7 +166,7 @@ class ContinuousContacts:
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
             "jammed": float(is_jammed.any()),
-            "bodies_show": float(copied(self.rigid.bodies.depth).max() > 1.0),
+            "bodies_show": float(copied(self.rigid.bodies.colliding.depth).max() > 1.0),
         }
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -223,7 +178,7 @@ class ContinuousContacts:
 
     def resolve(self, state: ClothState, dt: float, relax: Callable[[], bool]) -> None:
         """Change the displacements of a substep of dt [s] so that nothing crosses; see `ClothContacts`."""
-        motion = self._near.look(state)
+        motion = self._pairs.look(state)
         if not math.isfinite(motion) or motion > 1.0e6:
             return  # the solver says which quantity is not finite, or ran away
         self.rigid.begin_substep(dt)
@@ -242,7 +197,7 @@ class ContinuousContacts:
             # What was pushed farther than foreseen may have met what was not looked at.
             if not is_beyond:
                 break
-            self._near.look(state)
+            self._pairs.look(state)
         self._substeps += 1
         self._moved_as_one += self._nodes_as_one
         self._found += found
@@ -252,16 +207,15 @@ class ContinuousContacts:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
         for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
             self._begin_push(state, 0, is_first=True, short=short)
-            self._push_on(0, 0, 0, short=short)
-        if self._meets_cloth:
+        if self._pairs.meets:
             self._pairs.warm_up()
 
     def _find(self, state: ClothState, dt: float) -> int:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
         while True:
-            self._near.find(state, self._contacts, recovery)
-            found, *ends = self.rigid.find(state, self._patches, self._near.motion, self._contacts, recovery)
-            is_short = self._near.make_room_for(ends)
+            self._pairs.find(state, self._contacts, recovery)
+            found, *ends = self.rigid.find(state, self._patches, self._pairs.motion, self._contacts, recovery)
+            is_short = self._pairs.make_room_for(ends)
             if not self._contacts.make_room_for(found) and not is_short:
                 return found
 
@@ -271,52 +225,49 @@ class ContinuousContacts:
         """Push; first in turns with the springs, for as long as these `relax`."""
         short = self._is_short(count)
         while True:
-            pushing, touched, is_missing, settled = self._begin_push(state, count, is_first=is_first, short=short)
+            pushing, _, is_missing, settled = self._begin_push(state, count, is_first=is_first, short=short)
             self._iterations += STEPS if pushing else settled
             if not (pushing or settled) or not relax():
                 break
             is_first = False
         if pushing and is_missing:
             for step in range(0, MORE_ITERATIONS, STEPS):
-                self._push_on(pushing, touched, step, short=short)
+                self._push_on(state, step, finishes=step + STEPS >= MORE_ITERATIONS, short=short)
             self._iterations += MORE_ITERATIONS
 
     def _begin_push(self, state: ClothState, count: int, *, is_first: bool, short: bool) -> list[int]:
-        """A round of the first `STEPS` steps; what `begin_push` returns."""
-        contacts = self._contacts
-        found: list[int] = begin_push(
-            _momenta_from(0),
+        """A round of the first `STEPS` steps; what `push` returns."""
+        weigh_contacts(
             count,
-            contacts.found,
-            contacts.impulses(self._impulse_unit),
+            self._contacts.found,
+            self._contacts.impulses(self._impulse_unit),
             state.vertex_count,
             self._pushed,
             self._sums,
-            state.thickness,
             self.rigid.bodies.pushed,
             int(is_first),
             short,
         )
-        return found
+        return self._push_on(state, 0, finishes=True, short=short)
 
-    def _push_on(self, count: int, touched: int, first: int, *, short: bool) -> None:
-        """More steps of the contact iteration, from step `first` of `MORE_ITERATIONS` on."""
-        contacts = self._contacts
-        push_on(
+    def _push_on(self, state: ClothState, first: int, *, finishes: bool, short: bool) -> list[int]:
+        """Steps of the contact iteration, from step `first` on; what `push` returns."""
+        found: list[int] = push(
             _momenta_from(first),
             int(first == 0),
-            int(first + STEPS >= MORE_ITERATIONS),
-            count,
-            touched,
-            contacts.found,
-            contacts.impulses(self._impulse_unit),
+            int(finishes),
+            self._contacts.found,
+            self._contacts.impulses(self._impulse_unit),
             self._pushed,
+            self._sums,
+            state.thickness,
             self.rigid.bodies.pushed,
             short,
         )
+        return found
 
     def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
-        """Push, and at last tie together, until no pair can have crossed; what `NearCloth.finish` returns then."""
+        """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""
         for _ in range(REPAIRS):
             found = self._finish(state, count)
             if not found[0]:
@@ -327,7 +278,7 @@ class ContinuousContacts:
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
             while found[0] and zones.join(
-                contacts.vertices.to_numpy()[:count][contacts.crossing.to_numpy()[:count] == 1]
+                contacts.found.vertices.to_numpy()[:count][contacts.crossing.to_numpy()[:count] == 1]
             ):
                 state.displacement.from_numpy(zones.apply(state.displacement.to_numpy()))
                 found = self._finish(state, count)
@@ -338,7 +289,7 @@ class ContinuousContacts:
 
     def _finish(self, state: ClothState, count: int, *, is_changed: bool | None = None) -> Sequence[int]:
         is_changed = count > 0 if is_changed is None else is_changed
-        return self._near.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
+        return self._pairs.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
 
     def _is_short(self, count: int) -> bool:
         """Whether loops over so many contacts, and over all vertices, are."""

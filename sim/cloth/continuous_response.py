@@ -19,7 +19,6 @@ import taichi as ti
 from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, PushedNodes
 from sim.cloth.contact_answers import relative_displacement, thickness_between
 from sim.cloth.contact_iteration import Momenta, finish_push, push_apart
-from sim.cloth.contact_weights import weigh_contacts
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
 
@@ -28,52 +27,34 @@ TOLERANCE = 0.02
 
 
 @kernel
-def begin_push(
+def push(
     momenta: Momenta,
-    count: ti.i32,
+    starts: ti.i32,
+    finishes: ti.i32,
     contacts: Contacts,
     impulses: Impulses,
-    vertex_count: ti.i32,
     nodes: PushedNodes,
     sums: NodeSums,
     thickness: Floats,
     bodies: PushedBodies,
-    is_first: ti.i32,
     is_short: ti.template(),
 ) -> ti.math.ivec4:
-    """A round of contacts in one launch: which of them push, some steps of the iteration, and where these lead.
+    """Some steps of the iteration of a round (`weigh_contacts`), and where they lead if it `finishes`.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
-    `TOLERANCE`, and whether any are settled.
+    `TOLERANCE` then, and whether any were settled.
     """
-    weigh_contacts(count, contacts, impulses, vertex_count, nodes, sums, bodies, is_first, is_short)
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
-    push_apart(momenta, 1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
-    finish_push(1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
+    measured_end = finishes * pushing_count
+    push_apart(momenta, starts, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
+    finish_push(finishes, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for place in range(pushing_count):
+    for place in range(measured_end):
         c = impulses.pushing[place]
         w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
             sums.counter[3] = 1
     return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])
-
-
-@kernel
-def push_on(
-    momenta: Momenta,
-    starts: ti.i32,
-    finishes: ti.i32,
-    count: ti.i32,
-    touched_count: ti.i32,
-    contacts: Contacts,
-    impulses: Impulses,
-    nodes: PushedNodes,
-    bodies: PushedBodies,
-    is_short: ti.template(),
-):
-    """More steps of the iteration, and where they lead if it `finishes`."""
-    push_apart(momenta, starts, count, touched_count, contacts, impulses, nodes, bodies, is_short)
-    finish_push(finishes, count, touched_count, contacts, impulses, nodes, bodies, is_short)

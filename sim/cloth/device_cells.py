@@ -13,7 +13,7 @@ from sim.cloth.bundles import CellArrays, MeshNodes, NodeMotion, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
 from sim.cloth.device_springs import TINY_LENGTH, colour_bounds, colour_groups
 from sim.cloth.parameters import ClothParameters
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
@@ -49,12 +49,9 @@ class DeviceCells:
         self.is_damped = False
         self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
         self.multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
-        nodes, along, across = (ti.ndarray(kind, self.count * self.arity) for kind in (ti.i32, ti.f32, ti.f32))
-        nodes.from_numpy(np.ascontiguousarray(cells.nodes).ravel())
-        along.from_numpy(cells.along.astype(np.float32).ravel())
-        across.from_numpy(cells.across.astype(np.float32).ravel())
         self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
-        self.on_device = CellArrays(nodes, along, across, ti.Vector.ndarray(4, ti.f32, self.count))
+        listed = (on_device(each.ravel()) for each in (cells.nodes, cells.along, cells.across))
+        self.on_device = CellArrays(*listed, ti.Vector.ndarray(4, ti.f32, self.count))
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
@@ -66,10 +63,6 @@ class DeviceCells:
         if self.arity == TRIANGLE:
             nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)
             self.mesh.share.from_numpy((weight / np.bincount(nodes, weights=weight)[nodes]).astype(np.float32))
-
-    def energy(self, positions: NDArray[np.float64]) -> float:
-        """Elastic energy [J], in float64."""
-        return float(self.host.energies(positions, self.law).sum())
 
     def measure_strains(self, nodes: Nodes, motion: NodeMotion, *, is_damped: bool) -> None:
         """Mean strains of the nodes of triangles, as `motion` has carried them, with what damping adds to them."""
@@ -94,24 +87,18 @@ def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
     chunks = [np.arange(first, end, size) for first, end in pairwise(ends)]
     first = np.concatenate([*chunks, [len(own)]])
     mesh = MeshNodes(
-        node=_integers(own),
-        start=_integers(np.append(0, np.cumsum(np.bincount(place)))),
-        corner=_integers(np.argsort(place, kind="stable")),
+        node=on_device(own),
+        start=on_device(np.append(0, np.cumsum(np.bincount(place)))),
+        corner=on_device(np.argsort(place, kind="stable")),
         share=ti.ndarray(ti.f32, max(triangles.size, 1)),
-        swapped=_integers(cells.swapped.ravel()),
+        swapped=on_device(cells.swapped.ravel().astype(np.int32)),
         strain=ti.Vector.ndarray(2, ti.f32, max(len(triangles), 1)),
         mean=ti.Vector.ndarray(2, ti.f32, max(count, 1)),
-        piece=_integers(piece),
-        chunk=_integers(first),
-        first_chunk=_integers(np.append(0, np.cumsum([len(chunk) for chunk in chunks]))),
+        piece=on_device(piece),
+        chunk=on_device(first),
+        first_chunk=on_device(np.append(0, np.cumsum([len(chunk) for chunk in chunks])).astype(np.int32)),
     )
     return mesh, len(own), len(first) - 1, len(chunks)
-
-
-def _integers(values: NDArray[np.generic]) -> ti.Ndarray:
-    array = ti.ndarray(ti.i32, max(len(values), 1))
-    array.from_numpy(np.resize(values, max(len(values), 1)).astype(np.int32))
-    return array
 
 
 @func

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import Contraction, Nodes, SpringArrays
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.springs import Springs
-from sim.core.arrays import Integers, Vectors
+from sim.core.arrays import Integers, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.launch import kernel
 
@@ -27,13 +27,10 @@ class DeviceSprings:
     Attributes:
         arity: nodes of a spring.
         count: number of springs.
-        nodes: (count * arity,) int32.
-        coefficients: c_a of springs with four nodes, (count * 4,); those of the others are known.
-        law: (rest length [m], stiffness [N/m], damping over stiffness [s]), (count,) vec3.
+        on_device: the springs for kernels.
         poisson: Poisson's ratio of the cloth that a spring of a thread belongs to [-], (count,).
         is_damped: whether any of them is.
         contracts: whether any of them feels the strain across.
-        shift: what springs of threads count as longer by it [m], (count,).
         first_colours: first colour of each group of those that are solved in one launch, `first_colours.step` each;
             the last group may have empty ones.
         piece_of_colour: first piece of each colour, and number of pieces, (colours + 1,); a piece is one spring where
@@ -48,37 +45,26 @@ class DeviceSprings:
         self.host, self._cloth_of = springs, cloth_of
         self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = springs.arity, len(springs)
-        self.nodes = ti.ndarray(ti.i32, self.count * self.arity)
-        self.nodes.from_numpy(np.ascontiguousarray(springs.nodes).ravel())
-        own = springs.coefficients.ravel() if self.arity == 4 else np.zeros(1)
-        self.coefficients = ti.ndarray(ti.f32, len(own))
-        self.coefficients.from_numpy(own.astype(np.float32))
-        self.law = ti.Vector.ndarray(3, ti.f32, self.count)
+        self.on_device = SpringArrays(
+            nodes=on_device(springs.nodes.ravel()),
+            law=ti.Vector.ndarray(3, ti.f32, self.count),
+            coefficients=on_device(springs.coefficients.ravel() if self.arity == 4 else np.zeros(1)),
+            shift=ti.ndarray(ti.f32, self.count),
+        )
         self.in_segments = springs.in_segments
         starts = np.flatnonzero(np.diff(springs.segment, prepend=-1)) if self.in_segments else np.arange(self.count)
-        self.segment_start = ti.ndarray(ti.i32, len(starts) + 1)
-        self.segment_start.from_numpy(np.append(starts, self.count).astype(np.int32))
+        self.segment_start = on_device(np.append(starts, self.count))
         self.first_colours, self.piece_of_colour = colour_groups(springs.colour, starts, len(starts))
         self.stiffness: NDArray[np.float64] = np.zeros(self.count)
         self.damping: NDArray[np.float64] = np.zeros(self.count)
         self.poisson: NDArray[np.float64] = np.zeros(self.count)
         self.is_damped = self.contracts = False
-        self.shift = ti.ndarray(ti.f32, self.count)
-        self.shift.fill(0.0)
         if self.in_segments:
             places = 2 * springs.nodes + springs.kind[:, None]
             number = np.bincount(places.ravel(), minlength=2 * int(springs.nodes.max()) + 2)
-            self._share = 1.0 / np.maximum(number, 1)
-            poisson = ti.ndarray(ti.f32, self.count)
-            share, strain = (ti.ndarray(ti.f32, len(number)) for _ in range(2))
-            self._contraction = Contraction(ti.ndarray(ti.i32, self.count), poisson, share, strain)
-            self._contraction.axis.from_numpy(springs.kind)
-            self._contraction.share.from_numpy(self._share.astype(np.float32))
-
-    @property
-    def on_device(self) -> SpringArrays:
-        """The springs for kernels."""
-        return SpringArrays(self.nodes, self.law, self.coefficients, self.shift)
+            share = 1.0 / np.maximum(number, 1)
+            strain, poisson = ti.ndarray(ti.f32, len(number)), ti.ndarray(ti.f32, self.count)
+            self._contraction = Contraction(on_device(springs.kind), poisson, on_device(share), strain)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
@@ -91,15 +77,9 @@ class DeviceSprings:
             self.poisson = np.array([cloth.poisson_ratio for cloth in cloths])[self._cloth_of]
             self._contraction.poisson.from_numpy(self.poisson.astype(np.float32))
             self.contracts = bool(self.poisson.any())
-            self.shift.fill(0.0)
+            self.on_device.shift.fill(0.0)
         law = np.stack([self.host.rest, self.stiffness, self.damping], axis=1)
-        self.law.from_numpy(law.astype(np.float32))
-
-    def stretches(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """C = |d| - rest of each spring [m], (count,), with nodes at positions [m], (n, 3)."""
-        d = np.einsum("ma,mai->mi", self.host.coefficients, positions[self.host.nodes])
-        stretches: NDArray[np.float64] = np.linalg.norm(d, axis=1) - self.host.rest
-        return stretches
+        self.on_device.law.from_numpy(law.astype(np.float32))
 
     def contract(self, nodes: Nodes, displacement: ti.Ndarray) -> None:
         """Let springs of threads feel the strain across, as nodes are displaced: with tensions C (e_u + nu e_v).
@@ -109,22 +89,6 @@ class DeviceSprings:
         """
         if self.contracts:
             measure_contraction(self.on_device, self._contraction, nodes, displacement, self.count)
-
-    def energy(self, positions: NDArray[np.float64]) -> float:
-        """Elastic energy [J], in float64."""
-        stretch = self.stretches(positions)
-        return float((0.5 * self.stiffness * stretch * (stretch + self._shifts(stretch))).sum())
-
-    def _shifts(self, stretch: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`contract` in float64 on the host [m], (count,)."""
-        if not self.contracts:
-            return np.zeros(self.count)
-        own = 2 * self.host.nodes + self.host.kind[:, None]
-        strain = self._share * np.bincount(
-            own.ravel(), weights=np.repeat(stretch / self.host.rest, 2), minlength=len(self._share)
-        )
-        across: NDArray[np.float64] = strain[own ^ 1].mean(axis=1)
-        return self.poisson * self.host.rest * across
 
 
 def colour_groups(colours: NDArray[np.int32], starts: NDArray[np.integer], count: int) -> tuple[range, ti.Ndarray]:
@@ -141,9 +105,7 @@ def colour_groups(colours: NDArray[np.int32], starts: NDArray[np.integer], count
     groups = range(0, len(firsts), max(1, -(-len(firsts) // launches)))
     padding = [count] * (len(groups) * groups.step + 1 - len(firsts))
     firsts = np.concatenate([firsts, padding])
-    piece_of_colour = ti.ndarray(ti.i32, len(firsts))
-    piece_of_colour.from_numpy(firsts.astype(np.int32))
-    return groups, piece_of_colour
+    return groups, on_device(firsts.astype(np.int32))
 
 
 @kernel

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import EdgeBlocks, TriangleBlocks
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE
-from sim.core.arrays import Vectors
+from sim.core.arrays import Vectors, on_device
 from sim.core.bundles import func
 
 
@@ -42,11 +42,11 @@ def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Nda
     padded = np.full((places, numbers.shape[1]), NONE, dtype=np.int32)
     for block, (start, end) in zip(blocks, pairwise(starts), strict=False):
         padded[block * BLOCK : block * BLOCK + end - start] = numbers[start:end]
-    first_block = ti.ndarray(ti.i32, max(len(blocks), 2))
-    first_block.from_numpy(np.resize(blocks, max(len(blocks), 2)).astype(np.int32))
-    members = ti.Vector.ndarray(numbers.shape[1], ti.i32, places)
-    members.from_numpy(padded)
-    return first_block, members, *(ti.ndarray(ti.f32, places) for _ in range(6))
+    return (
+        on_device(np.resize(blocks, max(len(blocks), 2))),
+        on_device(padded),
+        *(ti.ndarray(ti.f32, places) for _ in range(6)),
+    )
 
 
 @func

@@ -12,7 +12,7 @@ from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, se
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.stable_step import longest_explicit_step
 from sim.cloth.state import ClothState
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.launch import kernel
 
 
@@ -43,10 +43,9 @@ class ExplicitSprings:
         coefficients = np.concatenate([coefficients.ravel() for _, coefficients in acting])
         order = np.argsort(nodes, kind="stable")
         start = np.searchsorted(nodes[order], np.arange(state.vertex_count + 1))
-        self._start = _integers(start)
-        self._spring = _integers(spring[order])
-        self._coefficient = ti.ndarray(ti.f32, len(order))
-        self._coefficient.from_numpy(coefficients[order].astype(np.float32))
+        self._start, self._spring, self._coefficient = (
+            on_device(each) for each in (start, spring[order], coefficients[order])
+        )
         self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
@@ -98,12 +97,6 @@ class ExplicitSprings:
 
     def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
         """Nor do they follow contacts."""
-
-
-def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
-    array = ti.ndarray(ti.i32, max(len(values), 1))
-    array.from_numpy(values.astype(np.int32))
-    return array
 
 
 @kernel

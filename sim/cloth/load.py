@@ -19,8 +19,6 @@ class NodeLoad:
     def __init__(self, count: int) -> None:
         self.mass, self._own_inverse = ti.ndarray(ti.f32, count), ti.ndarray(ti.f32, count)
         self.impulse = ti.Vector.ndarray(3, ti.f32, count)
-        self.mass.fill(0.0)
-        self.impulse.fill(0.0)
 
     def put_on(self, state: ClothState, gravity: Vector3, dt: float) -> None:
         """Let the nodes take their impulses and carry their loads; gravity [m/s²] is what they will feel in dt [s]."""

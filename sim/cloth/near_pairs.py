@@ -20,7 +20,7 @@ from sim.cloth.self_collision_kernels import (
     pair_vertices_with_triangles,
 )
 from sim.core.arrays import Integers
-from sim.core.launch import kernel
+from sim.core.launch import large_kernel
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
@@ -28,7 +28,7 @@ ENCLOSED_AT_A_TIME, SEARCHED_AT_A_TIME, DUE_AT_A_TIME = 8, 1, 4
 """Patches of which most are not needed, and pairs of patches, that a thread takes at a time: some microseconds."""
 
 
-@kernel
+@large_kernel
 def find_near_pairs(
     numbers: ti.math.ivec4,
     workers: ti.math.ivec3,

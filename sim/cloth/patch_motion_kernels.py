@@ -19,7 +19,7 @@ from sim.cloth.bundles import (
 from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
-from sim.core.launch import kernel
+from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Share, is_finite, reduced_tree, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
 
@@ -45,11 +45,14 @@ WIDENED = 1.25
 KEPT_MARGIN = 0.97
 """Part of what they may that they keep for the next substep, whatever they did: what they do swings about a mean."""
 
+LARGEST_STILL = 1.0e15
+"""Differences of displacements from which on none are fitted [m]."""
+
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
 
-@kernel
+@large_kernel
 def look_at_patches(
     vertex_count: ti.i32,
     nodes: TrackedNodes,
@@ -84,11 +87,12 @@ def look_at_patches(
     displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
     not hold; and of how many some elements are due.
     """
+    motion, budget, tree = ti.static((patches.bounds.motion, patches.budget, of_vertices.tree))
     patches_end, pairs_end = workers[0], workers[1]
     counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(of_vertices.tree.lanes):
+    for lane in range(tree.lanes):
         most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
         for k in range(of_vertices.items):
             i = lane * of_vertices.lane_step + k * of_vertices.item_step
@@ -97,12 +101,10 @@ def look_at_patches(
                 most, least = ti.max(most, u), ti.min(least, u)
                 off = ti.max(off, (nodes.position[i] - nodes.expected[i]).norm_sqr())
         for axis in ti.static(range(3)):
-            (
-                of_vertices.tree.partial[axis * of_vertices.tree.lanes + lane],
-                of_vertices.tree.partial[(3 + axis) * of_vertices.tree.lanes + lane],
-            ) = most[axis], -least[axis]
-        of_vertices.tree.partial[6 * of_vertices.tree.lanes + lane] = off
-    ends = reduced_tree(of_vertices.tree)
+            tree.partial[axis * tree.lanes + lane] = most[axis]
+            tree.partial[(3 + axis) * tree.lanes + lane] = -least[axis]
+        tree.partial[6 * tree.lanes + lane] = off
+    ends = reduced_tree(tree)
     middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
     size = ti.math.vec3(ends[0] + ends[3], ends[1] + ends[4], ends[2] + ends[5])
     astray = ti.select(vertex_count > 0, ti.sqrt(ends[6]), known_astray)
@@ -111,15 +113,11 @@ def look_at_patches(
         m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
         while m < patches.corners.count:
             fit_motion(m, still, patches.corners, nodes, patches.bounds)
-            patches.budget.moves[m] = (1.0 + SAFETY) * (
-                (patches.bounds.motion.shift[m] - middle).norm()
-                + patches.bounds.motion.turn[m].norm() * patches.bounds.motion.radius[m]
-                + patches.bounds.motion.rest[m]
+            budget.moves[m] = (1.0 + SAFETY) * (
+                (motion.shift[m] - middle).norm() + motion.turn[m].norm() * motion.radius[m] + motion.rest[m]
             )
-            patches.budget.travel[m] = (
-                patches.budget.spent[m] + astray + patches.budget.moves[m] + patches.budget.more[m]
-            )
-            if not patches.budget.travel[m] <= patches.budget.reach[m]:
+            budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
+            if not budget.travel[m] <= budget.reach[m]:
                 counters.found[2] = 1
             m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
     begin_sharing(counters.taken, 1)
@@ -138,6 +136,7 @@ def look_at_patches(
 @func
 def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNodes, patches: PatchBounds):
     """The box and the motion of a patch; displacements within `still` [m] of each other are not fitted any closer."""
+    (motion,) = ti.static((patches.motion,))
     first, last = corners.first[m], corners.first[m + 1]
     origin, u_first = nodes.position[corners.nodes[first]], nodes.displacement[corners.nodes[first]]
     least, most, u_least, u_most = origin, origin, u_first, u_first
@@ -149,9 +148,10 @@ def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNode
         x, u = nodes.position[i], nodes.displacement[i]
         least, most = ti.min(least, x), ti.max(most, x)
         u_least, u_most = ti.min(u_least, u), ti.max(u_most, u)
-        r, v = x - origin, u - u_first
-        r_sum, u_sum, moment = r_sum + r, u_sum + v, moment + r.cross(v)
-        squares, products = squares + r * r, products + r * r.yzx
+        if still < LARGEST_STILL:
+            r, v = x - origin, u - u_first
+            r_sum, u_sum, moment = r_sum + r, u_sum + v, moment + r.cross(v)
+            squares, products = squares + r * r, products + r * r.yzx
     patches.low[m], patches.high[m] = least, most
     x_0, u_0, w = 0.5 * (least + most), 0.5 * (u_least + u_most), ti.math.vec3(0.0)
     left, largest = (0.5 * (u_most - u_least)).norm_sqr(), (0.5 * (most - least)).norm_sqr()
@@ -171,13 +171,13 @@ def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNode
             r = nodes.position[i] - x_0
             left = ti.max(left, (nodes.displacement[i] - u_0 - w.cross(r)).norm_sqr())
             largest = ti.max(largest, r.norm_sqr())
-    (
-        patches.motion.centre[m],
-        patches.motion.shift[m],
-        patches.motion.turn[m],
-        patches.motion.radius[m],
-        patches.motion.rest[m],
-    ) = x_0, u_0, w, ti.sqrt(largest), ti.sqrt(left)
+    (motion.centre[m], motion.shift[m], motion.turn[m], motion.radius[m], motion.rest[m]) = (
+        x_0,
+        u_0,
+        w,
+        ti.sqrt(largest),
+        ti.sqrt(left),
+    )
 
 
 @kernel
@@ -342,24 +342,19 @@ def age_pair(
         astray: largest distance of a vertex from where it was left [m].
         counter: of both lists.
     """
+    (budget,) = ti.static((patches.budget,))
     thickness = ageing.thickness
     m, other = met.pairs[p][0], met.pairs[p][1]
-    if patches.budget.travel[m] + patches.budget.travel[other] > met.wake[p]:
-        whole, besides = (
-            patches.budget.moves[m] + patches.budget.moves[other],
-            patches.budget.more[m] + patches.budget.more[other],
-        )
+    if budget.travel[m] + budget.travel[other] > met.wake[p]:
+        whole, besides = (budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other])
         nearer = ti.min(approach_of(m, other, patches.bounds.motion), whole)
-        met.approach[p], met.allowed[p] = nearer, patches.budget.margin[m] + patches.budget.margin[other]
+        met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
         met.slack[p] -= 2.0 * astray
         is_searched = False
         if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
             gap = gap_of_boxes(m, other, patches.bounds.low, patches.bounds.high) - (1.0 + SAFETY_OF_DUE) * thickness
             if gap > whole + besides:
-                met.wake[p], met.slack[p] = (
-                    patches.budget.spent[m] + patches.budget.spent[other] + 2.0 * astray + gap,
-                    -1.0,
-                )
+                met.wake[p], met.slack[p] = (budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0)
                 met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
             else:
                 skin = ti.max(ageing.least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
@@ -419,11 +414,12 @@ def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: Su
     """What a patch used up of the lists in a substep, and its margin for the next one. If contacts changed it by more
     than `negligible` [m] it is fitted anew.
     """
-    margin, change = patches.budget.margin[m], ti.select(end.is_changed == 1, patches.budget.change[m], 0.0)
-    patches.budget.change[m] = change
-    patches.budget.spent[m] += patches.budget.moves[m] + change + end.astray
-    patches.budget.margin[m] = margin_after(end.is_changed, change, margin, end.least_margin)
-    patches.budget.more[m] = ti.max(patches.budget.margin[m] - end.half_thickness, 0.0)
+    (budget,) = ti.static((patches.budget,))
+    margin, change = budget.margin[m], ti.select(end.is_changed == 1, budget.change[m], 0.0)
+    budget.change[m] = change
+    budget.spent[m] += budget.moves[m] + change + end.astray
+    budget.margin[m] = margin_after(end.is_changed, change, margin, end.least_margin)
+    budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
     if change > end.negligible:
         fit_motion(m, end.still, patches.corners, nodes, patches.bounds)
 
@@ -431,12 +427,13 @@ def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: Su
 @func
 def finish_pair(p: ti.i32, met: PatchPairArrays, patches: MovingPatches, negligible: ti.f32):
     """The same of a pair of patches."""
+    (budget,) = ti.static((patches.budget,))
     if met.slack[p] > 0.0:
         m, other = met.pairs[p][0], met.pairs[p][1]
-        nearer = met.approach[p] + patches.budget.change[m] + patches.budget.change[other]
-        if ti.max(patches.budget.change[m], patches.budget.change[other]) > negligible:
+        nearer = met.approach[p] + budget.change[m] + budget.change[other]
+        if ti.max(budget.change[m], budget.change[other]) > negligible:
             nearer = approach_of(m, other, patches.bounds.motion)
             # A patch that was not fitted anew moves as noted, but for its change.
-            nearer += ti.select(patches.budget.change[m] > negligible, 0.0, patches.budget.change[m])
-            nearer += ti.select(patches.budget.change[other] > negligible, 0.0, patches.budget.change[other])
+            nearer += ti.select(budget.change[m] > negligible, 0.0, budget.change[m])
+            nearer += ti.select(budget.change[other] > negligible, 0.0, budget.change[other])
         met.slack[p] -= nearer

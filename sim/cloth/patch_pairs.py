@@ -11,6 +11,7 @@ from sim.cloth.bundles import (
     Ageing,
     BoxTree,
     Counters,
+    Four,
     KnownPairs,
     MovingPatches,
     PairPieces,
@@ -21,10 +22,12 @@ from sim.cloth.bundles import (
     SubstepEnd,
     TestedContacts,
     TrackedNodes,
+    Two,
 )
 from sim.cloth.contact_end import end_contacts
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_motion_kernels import (
+    LARGEST_STILL,
     look_at_patches,
     merge_boxes,
     pair_patches,
@@ -33,6 +36,7 @@ from sim.cloth.patch_motion_kernels import (
 )
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import NEVER, carry_pieces
+from sim.core.bundles import with_room
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
 
@@ -64,14 +68,8 @@ class PairList:
     """Pairs of elements, those of each pair of patches in a piece of its own; grows when it must.
 
     Attributes:
-        end: pieces are before this place.
-        vertices: a vertex and a triangle's corners, or the ends of two edges, (capacity,) ivec4.
-        wanted: distance that they keep [m], (capacity,); `UNKNOWN` until they have come so near that it matters.
-        due: they are looked at when `PatchPairs.left` is not above it [m], (capacity,).
-        pieces: first place of each piece, places, and how many of them are taken, (pairs of patches,) ivec4.
-        piece_due: the largest `due` of each piece [m]; `NEVER` where nothing is listed.
+        on_device: the list for kernels.
         capacity: places of pairs.
-        again: numbers of the pieces that were too short.
 
     Args:
         capacity: pairs of elements to start with.
@@ -83,24 +81,15 @@ class PairList:
     def __init__(self, *, capacity: int, pieces: int, ends: ti.Ndarray, number: int) -> None:
         self._ends, self._number = ends, number
         self._taken = ti.ndarray(ti.i32, 1)
-        self._allocate(capacity)
-        self.set_pieces(pieces)
-
-    @property
-    def on_device(self) -> PairPieces:
-        """The list for kernels."""
-        return PairPieces(self.pieces, self.piece_due, *self._listed, self.again)
-
-    @property
-    def _listed(self) -> tuple[ti.Ndarray, ...]:
-        return self.vertices, self.wanted, self.due
+        self.capacity = capacity
+        self.on_device = PairPieces(*_room_for_pieces(pieces), *_room_for_pairs(capacity))
+        self._spare = PairPieces(*_room_for_pieces(pieces), *_room_for_pairs(1))
 
     def set_pieces(self, capacity: int) -> None:
         """Make room for the pieces of so many pairs of patches, all empty."""
-        self.end = 0
         self._ends.fill(0)
-        self.pieces, self.piece_due, self.again = _room_for_pieces(capacity)
-        self._spare_pieces = _room_for_pieces(capacity)
+        self.on_device = PairPieces(*_room_for_pieces(capacity), *self.on_device[OF_PIECES:])
+        self._spare = PairPieces(*_room_for_pieces(capacity), *self._spare[OF_PIECES:])
 
     def carry(self, count: int, carried: ti.Ndarray, capacity: int) -> None:
         """Follow pairs of patches to their new numbers, with their pieces.
@@ -111,81 +100,65 @@ class PairList:
             capacity: most of them.
         """
         # Two sets of arrays in turn: new ones would have all launches prepared anew.
-        before = self.on_device
-        pieces, listed = (self.pieces, self.piece_due, self.again), self._listed
-        if self._spare_pieces[0].shape[0] < capacity:
-            self._spare_pieces = _room_for_pieces(capacity)
-        if self._spare[0].shape[0] < self.capacity:
-            self._spare = _room_for_pairs(self.capacity)
-        self.pieces, self.piece_due, self.again = self._spare_pieces
-        self.vertices, self.wanted, self.due = self._spare
-        self._spare_pieces, self._spare = pieces, listed
-        self.end = int(
-            carry_pieces(
-                count, workers_for(count), self._taken, carried, before, self.on_device, self._ends, self._number
-            )
-        )
+        before, now = self.on_device, self._spare
+        if now.pieces.shape[0] < capacity:
+            now = PairPieces(*_room_for_pieces(capacity), *now[OF_PIECES:])
+        if now.pairs.shape[0] < self.capacity:
+            now = PairPieces(*now[:OF_PIECES], *_room_for_pairs(self.capacity))
+        self.on_device, self._spare = now, before
+        carry_pieces(count, workers_for(count), self._taken, carried, before, now, self._ends, self._number)
 
     def reach_to(self, end: int) -> bool:
-        """Whether pieces up to this place did not fit; now there is room.
+        """Whether pieces up to this place did not fit; now there is room, and what was listed is kept.
 
         Raises:
             OverflowError: more pairs than any useful step has.
         """
         if end < 0 or end > MAX_PAIRS:
             raise OverflowError(TOO_MANY)
-        self.end, fits = end, end <= self.capacity
-        if not fits:
-            self._grow(int(GROWTH * end))
-        return not fits
+        if end <= self.capacity:
+            return False
+        self.resize(int(GROWTH * end))
+        return True
 
-    def _allocate(self, capacity: int) -> None:
+    def resize(self, capacity: int) -> None:
+        """Have so many places."""
+        kept, listed = min(self.capacity, capacity), self.on_device[OF_PIECES:]
         self.capacity = capacity
-        self.vertices, self.wanted, self.due = _room_for_pairs(capacity)
-        self._spare = _room_for_pairs(1)
-
-    def _grow(self, capacity: int) -> None:
-        """Make room for so many pairs, and keep those that are listed: when lists grow shows in no search after it."""
-        old, before = self.capacity, self._listed
-        self._allocate(capacity)
-        for source, target in zip(before, self._listed, strict=True):
-            values = source.to_numpy()
-            target.from_numpy(np.concatenate([values, np.zeros((capacity - old, *values.shape[1:]), values.dtype)]))
+        room = _room_for_pairs(capacity)
+        for source, target in zip(listed, room, strict=True):
+            values = target.to_numpy()
+            values[:kept] = source.to_numpy()[:kept]
+            target.from_numpy(values)
+        self.on_device = PairPieces(*self.on_device[:OF_PIECES], *room)
 
 
-def _room_for_pairs(capacity: int) -> tuple[ti.Ndarray, ...]:
-    """Arrays of `PairList`: vertices, wanted, due."""
-    return ti.Vector.ndarray(4, ti.i32, capacity), *(ti.ndarray(ti.f32, capacity) for _ in range(2))
+OF_PIECES = 3
+"""How many of the arrays of `PairPieces`, the first ones, have a number of each piece; others have one of each pair."""
 
 
 def _room_for_pieces(capacity: int) -> tuple[ti.Ndarray, ...]:
-    """Arrays of `PairList`: pieces, all empty, when they are due, numbers of those that are searched again."""
-    pieces, piece_due = ti.Vector.ndarray(4, ti.i32, capacity), ti.ndarray(ti.f32, capacity)
-    pieces.fill(0)
+    """Pieces, all empty, when they are due, numbers of those that are searched again."""
+    piece_due = ti.ndarray(ti.f32, capacity)
     piece_due.fill(NEVER)
-    return pieces, piece_due, ti.ndarray(ti.i32, capacity)
+    return ti.ndarray(Four, capacity), piece_due, ti.ndarray(ti.i32, capacity)
 
 
-def _room_for_patch_pairs(capacity: int) -> tuple[ti.Ndarray, ti.Ndarray]:
-    """Arrays of `PatchPairs`: pairs, slack."""
-    return ti.Vector.ndarray(2, ti.i32, capacity), ti.ndarray(ti.f32, capacity)
+def _room_for_pairs(capacity: int) -> tuple[ti.Ndarray, ...]:
+    """Pairs, wanted, due."""
+    return ti.ndarray(Four, capacity), ti.ndarray(ti.f32, capacity), ti.ndarray(ti.f32, capacity)
 
 
 class PatchPairs:
     """The pairs of patches that may meet within some substeps, and how much nearer each may come unsearched.
 
     Attributes:
-        count: number of pairs of patches.
-        pairs: their numbers, the smaller first, (count,) ivec2.
+        on_device: the pairs for kernels.
+        count: how many there are.
+        capacity: room for so many.
         bounds: boxes around patches at the last `look`, and the rigid motion of each in the substep.
-        expired: numbers of the pairs to be searched; `needed` is 1 for their patches, (m,).
-        due: numbers of the pairs of which elements have to be looked at, `due_count` of them.
-        approach: how much nearer points of a pair come at most in this substep [m], (count,); `allowed` how much
-            contacts may add to it.
-        slack: how much nearer elements of a pair may come that are not listed [m], (count,); `left` how much of it
-            those may use up that are, until they are due.
         carried: numbers that pairs had before the last `meet`, or -1, (count,).
-        reach: how far to search for the elements of each pair [m], (count,).
+        expired_count, due_count: how many pairs have to be searched, and have elements that have to be looked at.
 
     Args:
         patches: of the cloths.
@@ -193,56 +166,44 @@ class PatchPairs:
 
     def __init__(self, patches: Patches) -> None:
         self.patches = patches
-        m = max(patches.count, 1)
-        low, high, *fitted = (ti.Vector.ndarray(3, ti.f32, m) for _ in range(5))
-        self.bounds = PatchBounds(low, high, PatchMotion(*fitted, *(ti.ndarray(ti.f32, m) for _ in range(2))))
-        self._budget = PatchBudget(*(ti.ndarray(ti.f32, m) for _ in PatchBudget._fields))
+        m = patches.count
+        motion = with_room(PatchMotion, m)
+        self.bounds: PatchBounds = with_room(PatchBounds, m, motion=motion)
+        self._budget: PatchBudget = with_room(PatchBudget, m)
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
-        self._tree = BoxTree(patches.leaves, *(ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2)))
+        self._tree: BoxTree = with_room(BoxTree, 2 * patches.leaves, leaves=patches.leaves)
         self._moving = MovingPatches(patches.corner_lists, self.bounds, self._budget)
-        self._counter, self._taken = (ti.ndarray(ti.i32, 3) for _ in range(2))
-        self._counters = Counters(self._taken, self._counter)
-        self._first_known = ti.ndarray(ti.i32, 2 * m)
-        self.needed = ti.ndarray(ti.i32, m)
-        self.needed.fill(0)
+        self._counters: Counters = with_room(Counters, 3)
+        self._first_known = ti.ndarray(ti.i32, 2 * max(m, 1))
         self._maxima = LaneReduction(maxima=7, sums=0)
-        self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
-        self.count = self.due_count = self.expired_count = 0
+        self._astray, self._half_thickness, self._still, self._fits = 0.0, 0.0, 0.0, True
+        self.due_count = self.expired_count = 0
         self._is_short = is_short(patches.vertex_count, NODE_NS)
-        self._allocate(8 * m)
+        self._needed = ti.ndarray(ti.i32, max(m, 1))
+        self._allocate(8 * max(m, 1))
 
     def _allocate(self, capacity: int) -> None:
         self.capacity = capacity
-        self.pairs, self.slack = _room_for_patch_pairs(capacity)
-        self._spare = _room_for_patch_pairs(capacity)
-        self.expired, self.carried, self._known, self.due = (ti.ndarray(ti.i32, capacity) for _ in range(4))
-        self.reach, self._wake, self.left, self.approach, self.allowed = (
-            ti.ndarray(ti.f32, capacity) for _ in range(5)
-        )
+        self.on_device: PatchPairArrays = with_room(PatchPairArrays, capacity, count=0, needed=self._needed)
+        self._spare = ti.ndarray(Two, capacity), ti.ndarray(ti.f32, capacity)
+        self.carried, self._known = (ti.ndarray(ti.i32, capacity) for _ in range(2))
 
     @property
-    def on_device(self) -> PatchPairArrays:
-        """The pairs for kernels."""
-        return PatchPairArrays(
-            count=self.count,
-            pairs=self.pairs,
-            slack=self.slack,
-            wake=self._wake,
-            left=self.left,
-            approach=self.approach,
-            allowed=self.allowed,
-            reach=self.reach,
-            due=self.due,
-            expired=self.expired,
-            needed=self.needed,
-        )
+    def count(self) -> int:
+        """Number of pairs of patches."""
+        return int(self.on_device.count)
 
     def _tracked(self, state: ClothState) -> TrackedNodes:
         return TrackedNodes(state.position, state.displacement, self._expected)
 
-    def set_margin(self, thickness: float) -> None:
-        """Allow contacts to displace vertices by half a thickness [m], whatever they did before."""
-        self._half_thickness, self._still = 0.5 * thickness, STILL * thickness
+    def set_margin(self, thickness: float, *, fits: bool = True) -> None:
+        """Allow contacts to displace vertices by half a thickness [m], whatever they did before.
+
+        Without pairs of patches nothing `fits`: bodies do with boxes of patches and of their displacements, and
+        vertices are neither tested nor followed.
+        """
+        self._fits = fits
+        self._half_thickness, self._still = 0.5 * thickness, STILL * thickness if fits else LARGEST_STILL
         self._budget.margin.fill(MARGIN * thickness)
         self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
@@ -271,8 +232,9 @@ class PatchPairs:
         """
         patches, tree = self.patches, self._tree
         keeps = keeps and self._astray < thickness  # else cloth was put elsewhere, and nothing would be left of it
+        known_count = self.count if keeps else 0
         if not keeps:
-            self.count, self._astray = 0, 0.0
+            self._astray = 0.0
         place_leaves(
             patches.count,
             self.bounds.low,
@@ -287,23 +249,23 @@ class PatchPairs:
         first = patches.leaves
         while first := first // 2:
             merge_boxes(first, tree)
-        before = self.pairs, self.slack
+        before = self.on_device.pairs, self.on_device.slack
         known = KnownPairs(self._first_known, self._known, *before)
-        sort_known(self.count, patches.count, known, self._counter)
-        self.pairs, self.slack = self._spare
-        self._spare = before
+        sort_known(known_count, patches.count, known, self._counters.found)
+        pairs, slack = self._spare
+        self.on_device, self._spare = self.on_device._replace(pairs=pairs, slack=slack), before
         while True:
             found = pair_patches(
                 patches.count,
                 workers_for(patches.count),
-                self._taken,
+                self._counters.taken,
                 tree,
                 patches.cloth,
                 collides,
                 known,
                 self.on_device,
                 self.carried,
-                self._counter,
+                self._counters.found,
                 self.capacity,
             )
             if found < 0 or found > MAX_PAIRS:
@@ -311,7 +273,7 @@ class PatchPairs:
             if found <= self.capacity:
                 break
             self._allocate(int(GROWTH * found))
-        self.count = int(found)
+        self.on_device = self.on_device._replace(count=int(found))
         return keeps
 
     def age(self, state: ClothState, ageing: Ageing) -> int:
@@ -319,14 +281,15 @@ class PatchPairs:
 
         Args:
             state: at the start of the substep.
-            ageing: how; `PairList.piece_due` of both lists is `NEVER` after this where a pair is due.
+            ageing: how; `PairPieces.piece_due` of both lists is `NEVER` after this where a pair is due.
         """
         self._look(state, 0, ageing)
         return self.expired_count
 
     def _look(self, state: ClothState, vertex_count: int, ageing: Ageing | None) -> tuple[float, bool]:
         """Look at the patches unless there are no vertices, then age the pairs unless nothing is said about that."""
-        patches = self.patches
+        patches, looks_at_patches = self.patches, vertex_count > 0
+        vertex_count = vertex_count if self._fits else 0
         motion, astray, expired, due = look_at_patches(
             vertex_count,
             self._tracked(state),
@@ -335,8 +298,8 @@ class PatchPairs:
             self._still,
             self._moving,
             self.on_device,
-            ageing or Ageing(0.0, 0.0, self.left, self.left),
-            (workers_for(patches.count) if vertex_count else 0, workers_for(self.count) if ageing else 0),
+            ageing or Ageing(0.0, 0.0, self.on_device.left, self.on_device.left),
+            (workers_for(patches.count) if looks_at_patches else 0, workers_for(self.count) if ageing else 0),
             self._counters,
             self._is_short,
         )
@@ -370,10 +333,10 @@ class PatchPairs:
         """
         patches, half = self.patches, self._half_thickness
         found: list[int] = end_contacts(
-            count,
+            count if self._fits else 0,
             contacts.found,
-            TestedContacts(contacts.impulse, state.inverse_mass, state.thickness, contacts.crossing),
-            patches.vertex_count,
+            TestedContacts(contacts.impulses().impulse, state.inverse_mass, state.thickness, contacts.crossing),
+            patches.vertex_count if self._fits else 0,
             self._tracked(state),
             predicted,
             self._moving,

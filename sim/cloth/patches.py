@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import PatchElements, PatchNodes
+from sim.core.arrays import on_device
 from sim.core.reductions import runs_on_gpu
 
 if TYPE_CHECKING:
@@ -46,27 +46,25 @@ class Patches:
         self.vertex_count = len(host.position)
         self.leaves = 1 << max(self.count - 1, 0).bit_length()
         order = np.argsort(patch, kind="stable")
-        self.first_triangle = _array(_starts(patch, self.count))
-        self.triangles = ti.Vector.ndarray(3, ti.i32, max(len(triangles), 1))
-        self.triangles.from_numpy(triangles[order])
+        self.first_triangle = on_device(_starts(patch, self.count))
+        self.triangles = on_device(triangles[order])
 
         corner_patch, corner = np.unique(np.stack([np.repeat(patch, 3), triangles.ravel()]), axis=1)
-        self.first_corner, self.corners = _array(_starts(corner_patch, self.count)), _array(corner)
+        self.first_corner, self.corners = on_device(_starts(corner_patch, self.count)), on_device(corner)
         # The first patch that a vertex is a corner of owns it, and so an edge: the first with both of its ends in a
         # triangle, as edges are sides of triangles.
         owner = np.full(len(host.position), self.count)
         np.minimum.at(owner, corner, corner_patch)
-        self.first_vertex = _array(_starts(np.sort(owner), self.count))
-        self.vertices = _array(np.argsort(owner, kind="stable"))
+        self.first_vertex = on_device(_starts(np.sort(owner), self.count))
+        self.vertices = on_device(np.argsort(owner, kind="stable"))
 
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
         number = np.searchsorted(_key(edges, len(owner)), _key(sides, len(owner)))
         edge_owner = np.full(len(edges), self.count)
         np.minimum.at(edge_owner, number, np.repeat(patch, 3))
-        self.first_edge = _array(_starts(np.sort(edge_owner), self.count))
-        self.edges = ti.Vector.ndarray(2, ti.i32, max(len(edges), 1))
-        self.edges.from_numpy(edges[np.argsort(edge_owner, kind="stable")])
-        self.cloth = _array(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
+        self.first_edge = on_device(_starts(np.sort(edge_owner), self.count))
+        self.edges = on_device(edges[np.argsort(edge_owner, kind="stable")])
+        self.cloth = on_device(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
         self.corner_lists = PatchNodes(self.count, self.first_corner, self.corners)
         self.vertex_lists = PatchNodes(self.count, self.first_vertex, self.vertices)
         self.elements = PatchElements(self.count, self.first_edge, self.edges, self.first_triangle, self.triangles)
@@ -104,9 +102,3 @@ def _key(pairs: NDArray[np.integer], count: int) -> NDArray[np.int64]:
     """A number for each pair of vertices, in the order of sorted pairs."""
     key: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
     return key
-
-
-def _array(values: NDArray[np.integer]) -> ti.Ndarray:
-    array = ti.ndarray(ti.i32, max(len(values), 1))
-    array.from_numpy(np.ascontiguousarray(values if len(values) else [0], dtype=np.int32))
-    return array

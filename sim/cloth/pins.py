@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from sim.cloth.motion import move_pinned
 from sim.cloth.parameters import ClothParameters, PinParameters
-from sim.cloth.pin_paths import path_of_pin
 from sim.cloth.sheet import RestSheet
-from sim.cloth.start import pinned_nodes
+from sim.cloth.start import path_of_pin, pinned_nodes
 from sim.cloth.state import ClothState
+from sim.core.arrays import on_device
 from sim.core.motion import rotation
 from sim.core.motion.paths import KeyframePath
 from sim.core.parameters import Vector3
@@ -48,10 +48,7 @@ class Pin:
     def _take(self, nodes: NDArray[np.int64], arm: Floats) -> None:
         """Hold nodes that have these places about the centre [m], (p, 3)."""
         self.nodes, self._host_arm = nodes, arm
-        self._nodes = ti.ndarray(ti.i32, len(nodes))
-        self._nodes.from_numpy(nodes.astype(np.int32))
-        self._arm = ti.Vector.ndarray(3, ti.f32, len(nodes))
-        self._arm.from_numpy(arm.astype(np.float32))
+        self._nodes, self._arm = on_device(nodes), on_device(arm)
 
     def drop(self, nodes: NDArray[np.int64]) -> bool:
         """Hold these nodes no longer; returns whether any others are left."""

@@ -2,7 +2,8 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import Contacts, Impulses
+from sim.cloth.bundles import Contacts, Four, Impulses
+from sim.core.bundles import func, with_room
 
 VERTEX_TRIANGLE, EDGE_EDGE, WALL = -1, -2, -3
 """What a contact is between; from 0 on it is the number of the body that the cloth touches."""
@@ -20,27 +21,14 @@ class ContactList:
     w = sum_k weights[k] u[vertices[k]], minus that of the body. It has to satisfy n . w >= floor.
 
     Attributes:
-        vertices: up to four, (capacity,) of 4-vectors; of a vertex and a triangle in this order, of two edges in turn.
-        weights: signed, zero for vertices that do not count, (capacity,) of 4-vectors.
-        normal: unit vector from the second to the first, or out of the body, (capacity,) of 3-vectors.
-        floor: least relative displacement along the normal [m], or `INACTIVE`, (capacity,).
-        kind: `VERTEX_TRIANGLE`, `EDGE_EDGE`, `WALL`, or the number of a body, (capacity,).
-        arm: from the body's centre of mass to the point [m], (capacity,) of 3-vectors.
-        friction: Coulomb's coefficient [-], (capacity,).
-        mobility: what the relative displacement grows by per impulse, all contacts pushing alike [1/kg], (capacity,).
-        impulse: on the first, minus that on the second, times the step [kg m], (capacity,) of 3-vectors.
-        impulse_before, impulse_given: that of an iteration earlier, and that which displacements contain already.
-        pushing: numbers of the contacts that push, (capacity,); `push` is what they give in a step of the iteration, in
-            its units, in the same order.
+        capacity: there is room for so many.
+        found: what finding contacts writes; its `counter` has how many were found, also those beyond the capacity, and
+            the ends that lists of pairs need.
         crossing: whether pairs may have crossed, (capacity,).
-        used_by, use_weight: places of contacts in that order, and weights, vertex by vertex, (4 capacity,).
-        found: what finding contacts writes, for kernels.
-        counter: number of contacts found, also those beyond the capacity; ends that lists of pairs need, (3,).
     """
 
     def __init__(self, capacity: int) -> None:
-        self.counter = ti.ndarray(ti.i32, 3)
-        self.counter.fill(0)
+        self._counter = ti.ndarray(ti.i32, 3)
         self._allocate(capacity)
 
     def make_room_for(self, found: int) -> bool:
@@ -50,47 +38,35 @@ class ContactList:
         self._allocate(int(GROWTH * found))
         return True
 
-    def impulses(self, unit: float) -> Impulses:
+    def impulses(self, unit: float = 1.0) -> Impulses:
         """The impulses for kernels, which are summed up in a unit [kg m]."""
-        return Impulses(
-            self.mobility,
-            self.impulse,
-            self.impulse_before,
-            self.impulse_given,
-            self.pushing,
-            self.push,
-            self.used_by,
-            self.use_weight,
-            unit,
-        )
+        return self._impulses._replace(unit=unit)
 
     def _allocate(self, capacity: int) -> None:
         self.capacity = max(capacity, 1)
-        self.vertices = ti.Vector.ndarray(4, ti.i32, self.capacity)
-        self.weights = ti.Vector.ndarray(4, ti.f32, self.capacity)
-        self.normal = ti.Vector.ndarray(3, ti.f32, self.capacity)
-        self.floor = ti.ndarray(ti.f32, self.capacity)
-        self.kind = ti.ndarray(ti.i32, self.capacity)
-        self.arm = ti.Vector.ndarray(3, ti.f32, self.capacity)
-        self.friction = ti.ndarray(ti.f32, self.capacity)
-        self.mobility = ti.ndarray(ti.f32, self.capacity)
-        self.impulse, self.impulse_before, self.impulse_given = (
-            ti.Vector.ndarray(3, ti.f32, self.capacity) for _ in range(3)
-        )
-        self.pushing, self.crossing = (ti.ndarray(ti.i32, self.capacity) for _ in range(2))
-        self.push = ti.Vector.ndarray(3, ti.f32, self.capacity)
-        self.used_by, self.use_weight = ti.ndarray(ti.i32, 4 * self.capacity), ti.ndarray(ti.f32, 4 * self.capacity)
-        self.found = Contacts(
-            vertices=self.vertices,
-            weights=self.weights,
-            normal=self.normal,
-            floor=self.floor,
-            kind=self.kind,
-            arm=self.arm,
-            friction=self.friction,
-            counter=self.counter,
-            capacity=self.capacity,
-        )
+        self.found: Contacts = with_room(Contacts, self.capacity, counter=self._counter, capacity=self.capacity)
+        uses = {"used_by": ti.ndarray(ti.i32, 4 * self.capacity), "use_weight": ti.ndarray(ti.f32, 4 * self.capacity)}
+        self._impulses: Impulses = with_room(Impulses, self.capacity, unit=1.0, **uses)
+        self.crossing = ti.ndarray(ti.i32, self.capacity)
+
+
+@func
+def append_contact(
+    contacts: Contacts,
+    vertices: Four,
+    weights: ti.math.vec4,
+    normal: ti.math.vec3,
+    floor: ti.f32,
+    kind: ti.i32,
+    arm: ti.math.vec3,
+    friction: ti.f32,
+):
+    """Append a contact if there is room; it is counted in any case."""
+    slot = ti.atomic_add(contacts.counter[0], 1)
+    if slot < contacts.capacity:
+        contacts.vertices[slot], contacts.weights[slot], contacts.normal[slot] = vertices, weights, normal
+        contacts.floor[slot], contacts.kind[slot] = floor, kind
+        contacts.arm[slot], contacts.friction[slot] = arm, friction
 
 
 @ti.func

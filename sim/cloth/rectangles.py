@@ -4,19 +4,18 @@ from itertools import product
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
 from sim.cloth.bundles import Lines
 from sim.cloth.device_cells import SHEAR_SWEEPS
 from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.row_blocks import LANES, load_blocks, rectangle_of, row_blocks, store_blocks, strips_of
-from sim.cloth.row_springs import bend_lines, solve_cells_in_rows
-from sim.cloth.row_threads import measure_lines, solve_lines, straighten_lines
+from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, strips_of
+from sim.cloth.row_springs import bend_lines, measure_lines, solve_cells_in_rows, solve_lines, straighten_lines
 from sim.cloth.sheet import Grid
 from sim.cloth.spring_convergence import measure_excess_in_lines
 from sim.cloth.springs import bend_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
+from sim.core.host_access import put
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import is_short
 
@@ -45,19 +44,28 @@ class RectangleSprings:
 
     def __init__(self, state: ClothState, grid: Grid, first_node: int) -> None:
         self._state, self._grid = state, grid
-        self._blocks = row_blocks(grid.columns, grid.rows)
-        room = self._blocks.u_x.shape[0]
+        self._blocks = blocks = row_blocks(grid.columns, grid.rows)
+        room = blocks.u.shape[0]
         self._multipliers, *self._strains = (ti.Vector.ndarray(LANES, ti.f32, room) for _ in range(3))
-        self._strips = (strips_of(grid.columns), strips_of(grid.rows))
-        self._rectangle = rectangle_of(grid, first_node)
-        lengths = (grid.rows, grid.columns)
+        lengths, firsts, node_steps = (grid.rows, grid.columns), (0, blocks.turned), (grid.columns, 1)
+        strips = (strips_of(grid.columns), strips_of(grid.rows))
         self._lines = tuple(
-            Lines(lengths[1 - axis], axis, lengths[axis], self._strips[axis], self._strips[1 - axis])
+            Lines(
+                count=lengths[1 - axis],
+                length=lengths[axis],
+                first=firsts[axis],
+                strips=strips[axis],
+                other_first=firsts[1 - axis],
+                other_strips=strips[1 - axis],
+                first_node=first_node,
+                line_step=node_steps[1 - axis],
+                node_step=node_steps[axis],
+            )
             for axis in (ALONG_Y, ALONG_X)
         )
         self._steps = (grid.step_y, grid.step_x)
         self._thread_stiffness, self._bend_stiffness = (
-            tuple(ti.ndarray(ti.f32, strips * LANES) for strips in self._strips) for _ in range(2)
+            tuple(ti.ndarray(ti.f32, lines.strips * LANES) for lines in self._lines) for _ in range(2)
         )
         self._cell_stiffness = self._poisson = self._bend_damping = 0.0
         self._is_short = is_short(grid.columns * grid.rows, NODE_IN_ROWS_NS)
@@ -68,9 +76,9 @@ class RectangleSprings:
         across = ((grid.columns, grid.step_x), (grid.rows, grid.step_y))
         for axis, ((lines, spacing), step) in enumerate(zip(across, self._steps, strict=True)):
             width = line_widths(lines, spacing)
-            padding = np.zeros(self._strips[axis] * LANES - lines)
-            _fill(self._thread_stiffness[axis], cloth.plane_stiffness * width / step, padding + 1.0)
-            _fill(self._bend_stiffness[axis], cloth.bend_stiffness * bend_share(width, step), padding)
+            padding = np.zeros(self._lines[axis].strips * LANES - lines)
+            put(self._thread_stiffness[axis], np.append(cloth.plane_stiffness * width / step, padding + 1.0))
+            put(self._bend_stiffness[axis], np.append(cloth.bend_stiffness * bend_share(width, step), padding))
         self._cell_stiffness = cloth.shear_stiffness * grid.step_x * grid.step_y
         self._poisson = cloth.poisson_ratio
         self._bend_damping = cloth.bend_damping
@@ -78,7 +86,7 @@ class RectangleSprings:
     def displace(self, dt: float, sweeps: int) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps."""
         state, blocks, short = self._state, self._blocks, self._is_short
-        load_blocks(blocks, state.nodes, self._rectangle, short)
+        self._load()
         for axis in (ALONG_X, ALONG_Y):
             bend_lines(
                 blocks,
@@ -94,7 +102,7 @@ class RectangleSprings:
                 solve_cells_in_rows(
                     blocks,
                     parity,
-                    self._rectangle,
+                    self._lines[ALONG_Y],
                     self._steps[::-1],
                     self._cell_stiffness,
                     state.quantum,
@@ -105,13 +113,17 @@ class RectangleSprings:
             self._solve_threads(dt, is_first=sweep == 0)
         for axis in (ALONG_X, ALONG_Y):
             straighten_lines(blocks, self._lines[axis], short)
-        store_blocks(blocks, state.nodes, self._rectangle, short)
+        store_blocks(blocks, state.nodes, self._lines[ALONG_Y], short)
 
     def sweep(self, dt: float) -> None:
         """Solve the threads once more, after contacts."""
-        load_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
+        self._load()
         self._solve_threads(dt, is_first=False)
-        store_blocks(self._blocks, self._state.nodes, self._rectangle, self._is_short)
+        store_blocks(self._blocks, self._state.nodes, self._lines[ALONG_Y], self._is_short)
+
+    def _load(self) -> None:
+        for lines in self._lines:
+            load_blocks(self._blocks, self._state.nodes, lines, self._is_short)
 
     def _solve_threads(self, dt: float, *, is_first: bool) -> None:
         state, blocks, short = self._state, self._blocks, self._is_short
@@ -135,15 +147,10 @@ class RectangleSprings:
     def excess(self, dt: float) -> tuple[float, int]:
         """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
         state = self._state
-        steps = {ALONG_Y: (self._grid.columns, 1), ALONG_X: (1, self._grid.columns)}
         found = [
             measure_excess_in_lines(
                 self._multipliers,
-                self._blocks.turned,
                 self._lines[axis],
-                self._rectangle.first,
-                node_step,
-                line_step,
                 self._thread_stiffness[axis],
                 self._steps[axis],
                 self._poisson,
@@ -151,10 +158,6 @@ class RectangleSprings:
                 state.nodes,
                 dt * dt,
             )
-            for axis, (node_step, line_step) in steps.items()
+            for axis in (ALONG_Y, ALONG_X)
         ]
         return max(float(largest) for largest, _ in found), sum(int(count) for _, count in found)
-
-
-def _fill(array: ti.Ndarray, values: NDArray[np.float64], padding: NDArray[np.float64]) -> None:
-    array.from_numpy(np.concatenate([values, padding]).astype(np.float32))

@@ -22,15 +22,15 @@ from sim.cloth.bundles import (
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
-from sim.cloth.proximity_contacts import WALL, ContactList, least_displacement
+from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision import Box
 from sim.cloth.self_collision_kernels import lanes_of_pair
 from sim.cloth.state import ClothState
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.host_access import put
-from sim.core.launch import kernel
+from sim.core.launch import kernel, large_kernel
 from sim.core.motion.paths import Poses
 from sim.core.reductions import LaneReduction, Share, reduced
 from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
@@ -116,7 +116,7 @@ class RigidContact:
         self.bodies = CollisionBodies(geometries, friction)
         self._motion: BodyMotion | None = None
         self._advance = LARGEST_ADVANCE * 0.5 * np.array([geometry.shortest_edge for geometry in geometries])
-        self._advance_on_device = ti.ndarray(ti.f32, max(len(geometries), 1))
+        self._advance_on_device = on_device(self._advance)
         self._moving = ti.Vector.ndarray(4, ti.f32, max(len(geometries), 1))
         self._rates = LaneReduction(maxima=1, sums=0)
         self._is_warm = False  # `fastest_approach` is compiled in the first step, not in the first fast one
@@ -126,26 +126,17 @@ class RigidContact:
         self._shows = np.zeros(len(geometries), dtype=bool)
         self._longest, self._largest_half = 0.0, 0.0
         self._taken = ti.ndarray(ti.i32, 2)
-        if geometries:
-            put(self._advance_on_device, self._advance)
-        room = max(len(walls), 1)
-        corners = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(4))
-        self._walls = Walls(len(walls), 0.0, ti.Vector.ndarray(4, ti.f32, room), *corners)
-        if walls:
-            low, high = np.full((room, 3), -np.inf), np.full((room, 3), np.inf)
-            joined = {side: np.zeros((room, 3)) for side in (1.0, -1.0)}
-            for number, wall in enumerate(walls):
-                others = [axis for axis in range(3) if axis != wall.axis]
-                low[number, others], high[number, others] = wall.lower, wall.upper
-                for other in walls:
-                    if other.axis != wall.axis:
-                        joined[other.side][number, other.axis] = 1.0
-            planes = np.array([[*wall.normal, wall.side * wall.offset] for wall in walls])
-            self._walls.plane.from_numpy(planes.astype(np.float32))
-            self._walls.low.from_numpy(low.astype(np.float32))
-            self._walls.high.from_numpy(high.astype(np.float32))
-            self._walls.joined_low.from_numpy(joined[1.0].astype(np.float32))
-            self._walls.joined_high.from_numpy(joined[-1.0].astype(np.float32))
+        low, high = np.full((len(walls), 3), -np.inf), np.full((len(walls), 3), np.inf)
+        joined = {side: np.zeros((len(walls), 3)) for side in (1.0, -1.0)}
+        for number, wall in enumerate(walls):
+            others = [axis for axis in range(3) if axis != wall.axis]
+            low[number, others], high[number, others] = wall.lower, wall.upper
+            for other in walls:
+                if other.axis != wall.axis:
+                    joined[other.side][number, other.axis] = 1.0
+        planes = np.reshape([[*wall.normal, wall.side * wall.offset] for wall in walls], (len(walls), 4))
+        arrays = (on_device(each) for each in (planes, low, high, joined[1.0], joined[-1.0]))
+        self._walls = Walls(len(walls), 0.0, *arrays)
 
     def set_spacing(self, mean_edge: float, longest: float) -> None:
         """Say how long edges of the coarsest cloth are, and the longest of all [m]."""
@@ -306,13 +297,9 @@ def touch_wall(i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: t
         depth = ti.max(2.0 * WALL_DEPTH * half, walls.spacing, surface.displacement[i].norm())
         is_above = (x >= walls.low[w] - depth * walls.joined_low[w]).all()
         is_below = (x <= walls.high[w] + depth * walls.joined_high[w]).all()
-        slot = contacts.capacity
         if is_above and is_below and distance > -depth:
-            slot = ti.atomic_add(contacts.counter[0], 1)
-        if slot < contacts.capacity:
-            contacts.vertices[slot], contacts.weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)
-            contacts.normal[slot], contacts.floor[slot], contacts.kind[slot] = n, least, WALL
-            contacts.arm[slot], contacts.friction[slot] = ti.math.vec3(0.0), surface.friction[i]
+            weights, nothing = ti.math.vec4(1.0, 0.0, 0.0, 0.0), ti.math.vec3(0.0)
+            append_contact(contacts, Four(i), weights, n, least, WALL, nothing, surface.friction[i])
 
 
 @func
@@ -339,7 +326,6 @@ def touch_body(
     own_friction: ti.f32,
     corners: Four,
     weight: ti.math.vec4,
-    is_vertex: ti.template(),
     across: ti.math.mat3,
     half: ti.f32,
     recovery: ti.f32,
@@ -363,21 +349,16 @@ def touch_body(
             ti.atomic_max(bodies.depth[b], -0.5 * distance / half)
         if distance < keeps + relative.norm():
             gradient = ti.math.vec3(0.0)
-            for axis in ti.static(range(3)):
+            for axis in range(3):  # not unrolled: a distance takes long to compile
                 ahead = ti.math.vec3(0.0)
                 ahead[axis] = bodies.step[b]
                 gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
             n = turned @ unit_or(gradient, y)
-            if ti.static(not is_vertex):
-                n = unit_or(across @ n, n)
+            n = unit_or(across @ n, n)
             least = least_displacement(distance, keeps, recovery)
             if distance < keeps or n.dot(relative) < least:
-                slot = ti.atomic_add(contacts.counter[0], 1)
-                if slot < contacts.capacity:
-                    contacts.vertices[slot], contacts.weights[slot] = corners, weight
-                    contacts.normal[slot], contacts.floor[slot] = n, least
-                    contacts.kind[slot], contacts.arm[slot] = b, r
-                    contacts.friction[slot] = ti.sqrt(own_friction * bodies.friction[b])
+                friction = ti.sqrt(own_friction * bodies.friction[b])
+                append_contact(contacts, corners, weight, n, least, b, r, friction)
 
 
 @func
@@ -407,7 +388,7 @@ def deepest_on_triangle(y: Corners, in_middle: ti.f32, b: ti.i32, shapes: Shapes
     return best
 
 
-@kernel
+@large_kernel
 def find_rigid_contacts(
     patches: PatchLists,
     work: ti.math.ivec2,
@@ -429,27 +410,26 @@ def find_rigid_contacts(
     share a patch, and workers (`sim.core.scheduling`). Returns the numbers of the list's counter, whose first is 0
     then.
     """
+    vertices, elements = ti.static((patches.vertices, patches.elements))
     lanes, workers_end = work[0], work[1]
     begin_sharing(taken, 0)
     for worker in range(workers_end):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while item < patches.vertices.count * lanes:
+        while item < vertices.count * lanes:
             m = item // lanes
             reach = motion.shift[m].norm() + (1.0 + motion.turn[m].norm()) * motion.radius[m] + motion.rest[m]
             for w in range(walls.count):
                 above = walls.plane[w].xyz.dot(motion.centre[m]) - walls.plane[w].w
                 is_near = above < WITH_ROUNDING * (reach + largest_half)
-                place = ti.select(is_near, patches.vertices.first[m], patches.vertices.first[m + 1]) + item % lanes
-                while place < patches.vertices.first[m + 1]:
-                    touch_wall(patches.vertices.nodes[place], w, surface, walls, recovery, contacts)
+                place = ti.select(is_near, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                while place < vertices.first[m + 1]:
+                    touch_wall(vertices.nodes[place], w, surface, walls, recovery, contacts)
                     place += lanes
             if ti.static(meets != NO_BODIES):
                 may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-                place = (
-                    ti.select(may_touch == 1, patches.vertices.first[m], patches.vertices.first[m + 1]) + item % lanes
-                )
-                while place < patches.vertices.first[m + 1]:
-                    i = patches.vertices.nodes[place]
+                place = ti.select(may_touch == 1, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                while place < vertices.first[m + 1]:
+                    i = vertices.nodes[place]
                     half = 0.5 * surface.thickness[i]
                     for b in range(bodies.count):
                         touch_body(
@@ -460,7 +440,6 @@ def find_rigid_contacts(
                             surface.friction[i],
                             Four(i),
                             ti.math.vec4(1.0, 0.0, 0.0, 0.0),
-                            True,
                             ti.Matrix.identity(ti.f32, 3),
                             ti.select(inverse_mass[i] > 0.0, half, 0.0),
                             recovery,
@@ -473,20 +452,20 @@ def find_rigid_contacts(
         begin_sharing(taken, 1)
         for worker in range(workers_end):
             item = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
-            while item < patches.elements.count * lanes:
+            while item < elements.count * lanes:
                 m = item // lanes
                 may_touch = may_touch_bodies(m, motion, largest_half, bodies)
                 # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
-                edges = patches.elements.first_edge[m + 1] - patches.elements.first_edge[m]
-                end = edges + patches.elements.first_triangle[m + 1] - patches.elements.first_triangle[m]
+                edges = elements.first_edge[m + 1] - elements.first_edge[m]
+                end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
                 place = ti.select(may_touch == 1, item % lanes, end)
                 while place < end:
                     corners = Three(0)
                     if place < edges:
-                        ends = patches.elements.edges[patches.elements.first_edge[m] + place]
+                        ends = elements.edges[elements.first_edge[m] + place]
                         corners = Three(ends[0], ends[1], ends[1])
                     else:
-                        corners = patches.elements.triangles[patches.elements.first_triangle[m] + place - edges]
+                        corners = elements.triangles[elements.first_triangle[m] + place - edges]
                     for b in range(bodies.count):
                         if bodies.shows[b] > ti.cast(place < edges, ti.i32):
                             touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)
@@ -561,7 +540,6 @@ def touch_triangle(
                         surface.friction[v[0]],
                         Four(v[0], v[1], v[2], v[0]),
                         ti.math.vec4(share[0], share[1], share[2], 0.0),
-                        False,
                         across,
                         half,
                         recovery,

@@ -1,22 +1,22 @@
 """Rectangles of nodes on a CPU: eight neighbouring lines side by side, so that its vector units compute them at once.
 
 Lists of springs keep a core busy with addresses: 45 ns a spring, for some 40 operations. In a rectangle neighbours are
-known, and what eight lines along one direction do is the same. So a cloth is copied into blocks of eight numbers, once
-a substep: in upright blocks the lanes are neighbouring columns and lines run along y; in turned ones the lanes are rows
+known, and what eight lines along one direction do is the same. So a cloth is copied into blocks of eight nodes, once a
+substep: in upright blocks the lanes are neighbouring columns and lines run along y; in turned ones the lanes are rows
 and lines run along x. Lines of a block are solved by one task, from their first node to their last.
 
 Two things decide whether the compiler makes vector instructions of this (LLVM 15 in Taichi 1.7.4), each a factor of 4:
-a loop over lanes reads and writes local vectors alone, which whole blocks are read into and written from; and nothing
-is added to with `+=` in memory, which Taichi makes an atomic operation.
+a loop over lanes reads and writes local blocks alone, which whole blocks are read into and written from; and nothing is
+added to with `+=` in memory, which Taichi makes an atomic operation.
 """
 
 import functools
 
 import taichi as ti
 
-from sim.cloth.bundles import Nodes, Rectangle
-from sim.cloth.sheet import Grid
-from sim.core.launch import kernel
+from sim.cloth.bundles import Lines, Nodes
+from sim.core.bundles import func
+from sim.core.launch import kernel, large_kernel
 
 LANES = 8
 """Numbers of a block: what a vector unit of 256 bits holds. Twice as many are not faster, and take thrice as long to
@@ -24,13 +24,14 @@ compile."""
 
 LEAST_BLOCKS = 4096
 """Workspaces have this many blocks, up to 176 x 176 nodes, or a power of 4 times as many: kernels are compiled for each
-size, for some 20 s of a core until Taichi's cache on disk knows them."""
+size, until Taichi's cache on disk knows them."""
 
 SKEW = 5
 """Blocks more than a power of two, so that equal places of two fields do not share a line of the cache."""
 
 Block = ti.types.vector(LANES, ti.f32)
-IntegerBlock = ti.types.vector(LANES, ti.i32)
+VectorBlock = ti.types.matrix(3, LANES, ti.f32)
+LatticeBlock = ti.types.matrix(3, LANES, ti.i32)
 Blocks = ti.types.ndarray(dtype=Block, ndim=1)
 
 
@@ -43,45 +44,29 @@ class RowBlocks:
     the blocks; they have no inverse mass.
 
     Attributes:
-        lattice_x, lattice_y, lattice_z: as in `ClothState`.
-        u_x, u_y, u_z: displacements [m].
-        predicted_x, predicted_y, predicted_z: displacements before any spring acted, upright [m].
-        inverse_mass: [1/kg].
-        n_x, n_y, n_z, inverse_length, change, factor, tension: of the spring that leads on from the node.
+        lattice, u, inverse_mass: of nodes, as in `ClothState`; u is their displacement [m].
+        predicted: displacements before any spring acted, upright [m].
+        n, inverse_length, change, factor, tension: of the spring that leads on from the node.
         cell_multiplier: of the shear of the cell above the node, upright.
-        is_taut: whether piece p of the lines of strip s has tension to straighten, at `s * pieces + p`, and from
-            `turned` on for turned ones.
-        v_x, v_y, v_z, share, free_share: of the air's kernels: velocity [m/s], share in the force on any triangle, and
-            that of nodes that are not held.
-        lower_x, lower_y, lower_z, upper_x, upper_y, upper_z: force of the air on the two triangles of the cell [N].
+        is_taut: whether the lines of strip s have tension to straighten, at s, and from `turned` on for turned ones.
         turned: first turned block.
     """
 
     def __init__(self, blocks: int) -> None:
         self.turned = blocks
         count = 2 * blocks + SKEW
-        self.lattice_x, self.lattice_y, self.lattice_z = (ti.Vector.field(LANES, ti.i32, shape=count) for _ in range(3))
-        self.u_x, self.u_y, self.u_z, self.inverse_mass = (_blocks(count) for _ in range(4))
-        self.predicted_x, self.predicted_y, self.predicted_z = (_blocks(count) for _ in range(3))
-        self.n_x, self.n_y, self.n_z, self.inverse_length = (_blocks(count) for _ in range(4))
-        self.change, self.factor, self.tension, self.cell_multiplier = (_blocks(count) for _ in range(4))
+        self.lattice = ti.Matrix.field(3, LANES, ti.i32, shape=count)
+        self.u, self.predicted, self.n = (ti.Matrix.field(3, LANES, ti.f32, shape=count) for _ in range(3))
+        self.inverse_mass, self.inverse_length, self.change, self.factor, self.tension, self.cell_multiplier = (
+            ti.Vector.field(LANES, ti.f32, shape=count) for _ in range(6)
+        )
         self.is_taut = ti.field(ti.i32, shape=count)
-        # The air has done before springs start, and works in the same memory.
-        self.v_x, self.v_y, self.v_z = self.predicted_x, self.predicted_y, self.predicted_z
-        self.share, self.free_share = self.inverse_mass, self.inverse_length
-        self.lower_x, self.lower_y, self.lower_z = self.n_x, self.n_y, self.n_z
-        self.upper_x, self.upper_y, self.upper_z = self.change, self.factor, self.tension
-
-
-def _blocks(count: int) -> ti.MatrixField:
-    return ti.Vector.field(LANES, ti.f32, shape=count)
 
 
 def row_blocks(columns: int, rows: int) -> RowBlocks:
     """A workspace for a rectangle of so many nodes; nothing in it outlives a substep of one cloth."""
-    needed = LANES * strips_of(columns) * strips_of(rows)
     blocks = LEAST_BLOCKS
-    while blocks < needed:
+    while blocks < LANES * strips_of(columns) * strips_of(rows):
         blocks *= 4
     return _workspace(blocks)
 
@@ -92,103 +77,89 @@ def _workspace(blocks: int) -> RowBlocks:
     return RowBlocks(blocks)
 
 
-def rectangle_of(grid: Grid, first_node: int) -> Rectangle:
-    """A rectangle for kernels."""
-    return Rectangle(first_node, grid.columns, grid.rows, strips_of(grid.columns), strips_of(grid.rows))
-
-
 def strips_of(lines: int) -> int:
     """Blocks that so many lines side by side need."""
     return -(-lines // LANES)
 
 
 @ti.func
-def two_blocks(values: ti.template(), block, next_block):
-    """Two blocks as one vector, so that lanes can be looked up one to the side."""
-    one, other = values[block], values[next_block]
-    pair = ti.Vector([one[0] * 0 for _ in range(2 * LANES)])
-    for at in ti.static(range(LANES)):
-        pair[at] = one[at]
-        pair[LANES + at] = other[at]
-    return pair
+def lane(block: ti.template(), at):
+    """Three numbers of a lane."""
+    return ti.Vector([block[0, at], block[1, at], block[2, at]])
 
 
 @ti.func
-def turn_strip(values: ti.template(), turned, strip, strips, turned_strips):
-    """Copy the nodes of `strip`, LANES rows, from upright blocks to turned ones, which start at `turned`."""
-    for b in range(strips):
-        for lane in range(LANES):
-            block = values[strip]  # of the right type; all of it is overwritten
+def set_lane(block: ti.template(), at, vector):
+    """Give a lane three numbers."""
+    for c in ti.static(range(3)):
+        block[c, at] = vector[c]
+
+
+@ti.func
+def add_to_lane(block: ti.template(), at, vector):
+    """Add to the three numbers of a lane."""
+    for c in ti.static(range(3)):
+        block[c, at] += vector[c]
+
+
+@func
+def turn(values: ti.template(), strip: ti.i32, along: Lines):
+    """Copy vectors of the nodes of a strip of turned lines from upright blocks; nothing where lines are upright."""
+    if along.first > 0:
+        for b in range(along.other_strips):
+            for own in range(LANES):
+                block = VectorBlock(0.0)
+                for row in range(LANES):
+                    for c in ti.static(range(3)):
+                        block[c, row] = values[(strip * LANES + row) * along.other_strips + b][c, own]
+                values[along.first + (b * LANES + own) * along.strips + strip] = block
+
+
+@func
+def turn_back(values: ti.template(), strip: ti.i32, along: Lines):
+    """Copy vectors of the nodes of a strip of turned lines to upright blocks; nothing where lines are upright."""
+    if along.first > 0:
+        for b in range(along.other_strips):
             for row in range(LANES):
-                block[row] = values[(strip * LANES + row) * strips + b][lane]
-            values[turned + (b * LANES + lane) * turned_strips + strip] = block
+                block = VectorBlock(0.0)
+                for own in range(LANES):
+                    for c in ti.static(range(3)):
+                        block[c, own] = values[along.first + (b * LANES + own) * along.strips + strip][c, row]
+                values[(strip * LANES + row) * along.other_strips + b] = block
 
 
-@ti.func
-def turn_strip_back(values: ti.template(), turned, strip, strips, turned_strips):
-    """Copy the nodes of `strip` from turned blocks to upright ones."""
-    for b in range(strips):
-        for row in range(LANES):
-            block = values[strip]
-            for lane in range(LANES):
-                block[lane] = values[turned + (b * LANES + lane) * turned_strips + strip][row]
-            values[(strip * LANES + row) * strips + b] = block
+@large_kernel
+def load_blocks(blocks: ti.template(), nodes: Nodes, along: Lines, is_short: ti.template()):
+    """Fill the blocks of lines along one direction with the nodes of a cloth, and none beyond its border.
 
-
-@ti.func
-def turn_displacements(blocks: ti.template(), strip, strips, turned_strips):
-    """Copy the displacements of the nodes of `strip` from upright blocks to turned ones."""
-    for values in ti.static((blocks.u_x, blocks.u_y, blocks.u_z)):
-        turn_strip(values, blocks.turned, strip, strips, turned_strips)
-
-
-@ti.func
-def turn_displacements_back(blocks: ti.template(), strip, strips, turned_strips):
-    """Copy the displacements of the nodes of `strip` from turned blocks to upright ones."""
-    for values in ti.static((blocks.u_x, blocks.u_y, blocks.u_z)):
-        turn_strip_back(values, blocks.turned, strip, strips, turned_strips)
-
-
-@kernel
-def load_blocks(blocks: ti.template(), nodes: Nodes, grid: Rectangle, is_short: ti.template()):
-    """Fill upright and turned blocks with a cloth whose first node is `first`."""
+    Turned ones get their displacements by `turn`.
+    """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for strip in range(grid.turned_strips):
-        for r in range(LANES):
-            j = strip * LANES + r
-            for b in range(grid.strips):
-                x, y, z, w = Block(0.0), Block(0.0), Block(0.0), Block(0.0)
-                l_x, l_y, l_z = IntegerBlock(0), IntegerBlock(0), IntegerBlock(0)
-                if j < grid.rows:
-                    for lane in range(ti.min(LANES, grid.columns - b * LANES)):
-                        i = grid.first + j * grid.columns + b * LANES + lane
-                        x[lane], y[lane], z[lane] = (
-                            nodes.displacement[i].x,
-                            nodes.displacement[i].y,
-                            nodes.displacement[i].z,
-                        )
-                        l_x[lane], l_y[lane], l_z[lane] = nodes.lattice[i].x, nodes.lattice[i].y, nodes.lattice[i].z
-                        w[lane] = nodes.inverse_mass[i]
-                q = j * grid.strips + b
-                blocks.u_x[q], blocks.u_y[q], blocks.u_z[q] = x, y, z
-                blocks.predicted_x[q], blocks.predicted_y[q], blocks.predicted_z[q] = x, y, z
-                blocks.lattice_x[q], blocks.lattice_y[q], blocks.lattice_z[q] = l_x, l_y, l_z
-                blocks.inverse_mass[q] = w
-        for values in ti.static((blocks.lattice_x, blocks.lattice_y, blocks.lattice_z, blocks.inverse_mass)):
-            turn_strip(values, blocks.turned, strip, grid.strips, grid.turned_strips)
+    for strip in range(along.strips):
+        for k in range(along.other_strips * LANES):
+            u, lattice, weight = VectorBlock(0.0), LatticeBlock(0), Block(0.0)
+            if k < along.length:
+                for at in range(ti.min(LANES, along.count - strip * LANES)):
+                    i = along.first_node + (strip * LANES + at) * along.line_step + k * along.node_step
+                    if along.first == 0:
+                        set_lane(u, at, nodes.displacement[i])
+                    set_lane(lattice, at, nodes.lattice[i])
+                    weight[at] = nodes.inverse_mass[i]
+            q = along.first + k * along.strips + strip
+            blocks.lattice[q], blocks.inverse_mass[q] = lattice, weight
+            if along.first == 0:
+                blocks.u[q], blocks.predicted[q] = u, u
 
 
 @kernel
-def store_blocks(blocks: ti.template(), nodes: Nodes, grid: Rectangle, is_short: ti.template()):
+def store_blocks(blocks: ti.template(), nodes: Nodes, along: Lines, is_short: ti.template()):
     """Write the displacements of the upright blocks to the nodes of the cloth."""
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for j in range(grid.rows):
-        for b in range(grid.strips):
-            q = j * grid.strips + b
-            x, y, z = blocks.u_x[q], blocks.u_y[q], blocks.u_z[q]
-            for lane in range(ti.min(LANES, grid.columns - b * LANES)):
-                nodes.displacement[grid.first + j * grid.columns + b * LANES + lane] = ti.math.vec3(
-                    x[lane], y[lane], z[lane]
-                )
+    for k in range(along.length):
+        for strip in range(along.strips):
+            u = blocks.u[k * along.strips + strip]
+            for at in range(ti.min(LANES, along.count - strip * LANES)):
+                i = along.first_node + (strip * LANES + at) * along.line_step + k * along.node_step
+                nodes.displacement[i] = lane(u, at)

@@ -1,19 +1,26 @@
-"""Bend springs and cells of a rectangle, eight lines at a time (see `row_blocks`)."""
+"""Springs and cells of a rectangle, eight lines at a time (see `row_blocks`): what `xpbd`, `device_cells` and `threads`
+do for lists, and have the formulas of.
+
+Lines are threads along one direction; `quantum` is the unit of the lattice [m], `dt_squared` in s²; for `is_short` see
+`sim.core.scheduling`.
+"""
 
 import taichi as ti
 
-from sim.cloth.bundles import Lines, Rectangle
+from sim.cloth.bundles import Lines
 from sim.cloth.device_cells import over_relaxed
 from sim.cloth.device_springs import TINY_LENGTH
-from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, two_blocks
+from sim.cloth.row_blocks import LANES, Block, Blocks, VectorBlock, add_to_lane, lane, set_lane, turn, turn_back
+from sim.cloth.threads import direction_of, tension_to_turn
 from sim.core.arrays import Floats
-from sim.core.launch import kernel
+from sim.core.bundles import func
+from sim.core.launch import large_kernel
 
 BEND_COLOURS = 3
 """Bend springs along a line that share no node: every third one."""
 
 
-@kernel
+@large_kernel
 def bend_lines(
     blocks: ti.template(),
     along: Lines,
@@ -23,82 +30,81 @@ def bend_lines(
     gamma: ti.f32,
     is_short: ti.template(),
 ):
-    """The bend springs of all lines along one direction, colour by colour; `solve_bend` has the formula.
+    """The bend springs of all lines along one direction, colour by colour, as `solve_bend`.
 
-    Args:
-        blocks: workspace.
-        along: the lines.
-        stiffness: of the springs of each line [N/m], (strips * LANES,).
-        quantum: unit of the lattice [m].
-        dt_squared: [s²].
-        gamma: damping over stiffness and dt [-].
-        is_short: see `sim.core.scheduling`.
+    `stiffness` is of the springs of each line [N/m], (strips * LANES,), `gamma` their damping over stiffness and dt.
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for strip in range(along.strips):
-        first = 0
-        if along.is_turned:
-            first = blocks.turned
-            turn_displacements(blocks, strip, along.other_strips, along.strips)
+        turn(blocks.u, strip, along)
         strength = Block(0.0)
         for at in range(LANES):
             strength[at] = dt_squared * stiffness[strip * LANES + at]
         for colour in range(BEND_COLOURS):
             for m in range((along.length - colour) // BEND_COLOURS):
-                a = first + (colour + BEND_COLOURS * m) * along.strips + strip
+                a = along.first + (colour + BEND_COLOURS * m) * along.strips + strip
                 b, c = a + along.strips, a + 2 * along.strips
-                a_x, a_y, a_z, w_a = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a], blocks.inverse_mass[a]
-                b_x, b_y, b_z, w_b = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b], blocks.inverse_mass[b]
-                c_x, c_y, c_z, w_c = blocks.u_x[c], blocks.u_y[c], blocks.u_z[c], blocks.inverse_mass[c]
-                p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
-                q_x, q_y, q_z = blocks.lattice_x[b], blocks.lattice_y[b], blocks.lattice_z[b]
-                r_x, r_y, r_z = blocks.lattice_x[c], blocks.lattice_y[c], blocks.lattice_z[c]
+                u_a, u_b, u_c = blocks.u[a], blocks.u[b], blocks.u[c]
+                p_a, p_b, p_c = blocks.lattice[a], blocks.lattice[b], blocks.lattice[c]
+                w_a, w_b, w_c = blocks.inverse_mass[a], blocks.inverse_mass[b], blocks.inverse_mass[c]
                 for at in range(LANES):
-                    moved_x = a_x[at] - 2.0 * b_x[at] + c_x[at]
-                    moved_y = a_y[at] - 2.0 * b_y[at] + c_y[at]
-                    moved_z = a_z[at] - 2.0 * b_z[at] + c_z[at]
-                    d_x = quantum * ti.cast((p_x[at] - q_x[at]) + (r_x[at] - q_x[at]), ti.f32) + moved_x
-                    d_y = quantum * ti.cast((p_y[at] - q_y[at]) + (r_y[at] - q_y[at]), ti.f32) + moved_y
-                    d_z = quantum * ti.cast((p_z[at] - q_z[at]) + (r_z[at] - q_z[at]), ti.f32) + moved_z
-                    squared = d_x * d_x + d_y * d_y + d_z * d_z
-                    error = squared + gamma * (d_x * moved_x + d_y * moved_y + d_z * moved_z)
+                    moved = lane(u_a, at) - 2.0 * lane(u_b, at) + lane(u_c, at)
+                    at_start = (lane(p_a, at) - lane(p_b, at)) + (lane(p_c, at) - lane(p_b, at))
+                    d = quantum * ti.cast(at_start, ti.f32) + moved
+                    squared = d.dot(d)
+                    error = squared + gamma * d.dot(moved)
                     weight = strength[at] * (w_a[at] + 4.0 * w_b[at] + w_c[at])
-                    floor = ti.max(squared, TINY_LENGTH * TINY_LENGTH)  # flat cloth has no error either
-                    f = -strength[at] * error / (floor * (weight * (1.0 + gamma) + 1.0))
-                    a_x[at] += w_a[at] * f * d_x
-                    a_y[at] += w_a[at] * f * d_y
-                    a_z[at] += w_a[at] * f * d_z
-                    b_x[at] -= 2.0 * w_b[at] * f * d_x
-                    b_y[at] -= 2.0 * w_b[at] * f * d_y
-                    b_z[at] -= 2.0 * w_b[at] * f * d_z
-                    c_x[at] += w_c[at] * f * d_x
-                    c_y[at] += w_c[at] * f * d_y
-                    c_z[at] += w_c[at] * f * d_z
-                blocks.u_x[a], blocks.u_y[a], blocks.u_z[a] = a_x, a_y, a_z
-                blocks.u_x[b], blocks.u_y[b], blocks.u_z[b] = b_x, b_y, b_z
-                blocks.u_x[c], blocks.u_y[c], blocks.u_z[c] = c_x, c_y, c_z
-        if along.is_turned:
-            turn_displacements_back(blocks, strip, along.other_strips, along.strips)
+                    least = ti.max(squared, TINY_LENGTH * TINY_LENGTH)  # flat cloth has no error either
+                    impulse = -strength[at] * error / (least * (weight * (1.0 + gamma) + 1.0)) * d
+                    add_to_lane(u_a, at, w_a[at] * impulse)
+                    add_to_lane(u_b, at, -2.0 * w_b[at] * impulse)
+                    add_to_lane(u_c, at, w_c[at] * impulse)
+                blocks.u[a], blocks.u[b], blocks.u[c] = u_a, u_b, u_c
+        turn_back(blocks.u, strip, along)
 
 
 @ti.func
-def keep_two_blocks(values: ti.template(), block, pair, keeps_both):
-    """Write both blocks back, or the first."""
-    one, next_one = Block(0.0), Block(0.0)
-    for at in ti.static(range(LANES)):
-        one[at] = pair[at]
-        next_one[at] = pair[LANES + at]
-    values[block] = one
-    if keeps_both:
-        values[block + 1] = next_one
+def with_next(values: ti.template(), at, kind: ti.template()):
+    """A block of vectors and the first lane of the block after it."""
+    own, after = values[at], values[at + 1]
+    wide = ti.Matrix.zero(kind, 3, LANES + 1)
+    for c in ti.static(range(3)):
+        for k in ti.static(range(LANES)):
+            wide[c, k] = own[c, k]
+        wide[c, LANES] = after[c, 0]
+    return wide
 
 
-@kernel
+@ti.func
+def keep_with_next(values: ti.template(), at, wide: ti.template(), keeps_next):
+    """Write a block back, and the first lane of the next one if that is kept, too."""
+    own = VectorBlock(0.0)
+    for c in ti.static(range(3)):
+        for k in ti.static(range(LANES)):
+            own[c, k] = wide[c, k]
+    values[at] = own
+    if keeps_next:
+        for c in ti.static(range(3)):
+            values[at + 1][c, 0] = wide[c, LANES]
+
+
+@ti.func
+def weights_with_next(values: ti.template(), at):
+    """A block of numbers and the first lane of the block after it."""
+    own, after = values[at], values[at + 1]
+    wide = ti.Vector.zero(ti.f32, LANES + 1)
+    for k in ti.static(range(LANES)):
+        wide[k] = own[k]
+    wide[LANES] = after[0]
+    return wide
+
+
+@large_kernel
 def solve_cells_in_rows(
     blocks: ti.template(),
     parity: ti.i32,
-    grid: Rectangle,
+    along: Lines,
     steps: ti.math.vec2,
     stiffness: ti.f32,
     quantum: ti.f32,
@@ -106,90 +112,204 @@ def solve_cells_in_rows(
     is_first: ti.i32,
     is_short: ti.template(),
 ):
-    """The shear of all cells in every second row of cells, from row `parity` on; `solve_shear` has the formula.
+    """The shear of all cells in every second row of cells, from row `parity` on, as `solve_shear`, for upright lines.
 
     In each row every second cell first, then those between, which share nodes with them: all are computed alike, eight
     at a time, and every second one acts. `steps` are the lengths of a cell [m], `stiffness` is G times its area [J].
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for pair in range((grid.rows - parity) // 2):
-        lower = (2 * pair + parity) * grid.strips
+    for pair in range((along.length - parity) // 2):
+        lower = (2 * pair + parity) * along.strips
         strength = stiffness * dt_squared
         half = ti.sqrt(0.5)
-        along, across = 0.5 / steps[0], 0.5 / steps[1]
+        # d_u + d_v and d_u - d_v are these multiples of the diagonals of a cell, upwards and downwards.
+        total, between = 0.5 / steps[0] + 0.5 / steps[1], 0.5 / steps[0] - 0.5 / steps[1]
         for way in range(2):
-            for k in range(grid.strips):
-                a, b = lower + k, lower + grid.strips + k
-                a_x, a_y = two_blocks(blocks.u_x, a, a + 1), two_blocks(blocks.u_y, a, a + 1)
-                a_z, w_a = two_blocks(blocks.u_z, a, a + 1), two_blocks(blocks.inverse_mass, a, a + 1)
-                b_x, b_y = two_blocks(blocks.u_x, b, b + 1), two_blocks(blocks.u_y, b, b + 1)
-                b_z, w_b = two_blocks(blocks.u_z, b, b + 1), two_blocks(blocks.inverse_mass, b, b + 1)
-                p_x, p_y = two_blocks(blocks.lattice_x, a, a + 1), two_blocks(blocks.lattice_y, a, a + 1)
-                p_z, q_z = two_blocks(blocks.lattice_z, a, a + 1), two_blocks(blocks.lattice_z, b, b + 1)
-                q_x, q_y = two_blocks(blocks.lattice_x, b, b + 1), two_blocks(blocks.lattice_y, b, b + 1)
+            for k in range(along.strips):
+                a, b = lower + k, lower + along.strips + k
+                u_a, u_b = with_next(blocks.u, a, ti.f32), with_next(blocks.u, b, ti.f32)
+                p_a, p_b = with_next(blocks.lattice, a, ti.i32), with_next(blocks.lattice, b, ti.i32)
+                w_a, w_b = weights_with_next(blocks.inverse_mass, a), weights_with_next(blocks.inverse_mass, b)
                 multiplier = blocks.cell_multiplier[a]
-                rise_x, rise_y, rise_z = Block(0.0), Block(0.0), Block(0.0)
-                fall_x, fall_y, fall_z = Block(0.0), Block(0.0), Block(0.0)
-                cells = grid.columns - 1 - k * LANES
+                rise, fall = VectorBlock(0.0), VectorBlock(0.0)
+                cells = along.count - 1 - k * LANES
                 for at in range(LANES):
-                    # From each corner to the opposite one, upwards and downwards.
-                    up_x = quantum * ti.cast(q_x[at + 1] - p_x[at], ti.f32) + (b_x[at + 1] - a_x[at])
-                    up_y = quantum * ti.cast(q_y[at + 1] - p_y[at], ti.f32) + (b_y[at + 1] - a_y[at])
-                    up_z = quantum * ti.cast(q_z[at + 1] - p_z[at], ti.f32) + (b_z[at + 1] - a_z[at])
-                    down_x = quantum * ti.cast(p_x[at + 1] - q_x[at], ti.f32) + (a_x[at + 1] - b_x[at])
-                    down_y = quantum * ti.cast(p_y[at + 1] - q_y[at], ti.f32) + (a_y[at + 1] - b_y[at])
-                    down_z = quantum * ti.cast(p_z[at + 1] - q_z[at], ti.f32) + (a_z[at + 1] - b_z[at])
-                    # d_u + d_v and d_u - d_v, and their directions n and m.
-                    total, between = along + across, along - across
-                    n_x, n_y, n_z = (
-                        total * up_x + between * down_x,
-                        total * up_y + between * down_y,
-                        total * up_z + between * down_z,
-                    )
-                    m_x, m_y, m_z = (
-                        total * down_x + between * up_x,
-                        total * down_y + between * up_y,
-                        total * down_z + between * up_z,
-                    )
-                    longer = ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), TINY_LENGTH)
-                    shorter = ti.max(ti.sqrt(m_x * m_x + m_y * m_y + m_z * m_z), TINY_LENGTH)
-                    n_x, n_y, n_z = n_x / longer, n_y / longer, n_z / longer
-                    m_x, m_y, m_z = m_x / shorter, m_y / shorter, m_z / shorter
-                    # Derivatives of e_s by the corners: r of the upper right one, t of the lower right one.
-                    more, less = half * total, half * between
-                    r_x, r_y, r_z = more * n_x - less * m_x, more * n_y - less * m_y, more * n_z - less * m_z
-                    t_x, t_y, t_z = less * n_x - more * m_x, less * n_y - more * m_y, less * n_z - more * m_z
-                    weight = (w_a[at] + w_b[at + 1]) * (r_x * r_x + r_y * r_y + r_z * r_z) + (w_a[at + 1] + w_b[at]) * (
-                        t_x * t_x + t_y * t_y + t_z * t_z
-                    )
-                    acts = at < cells and at % 2 == way
+                    upwards = ti.cast(lane(p_b, at + 1) - lane(p_a, at), ti.f32)
+                    downwards = ti.cast(lane(p_a, at + 1) - lane(p_b, at), ti.f32)
+                    up = quantum * upwards + (lane(u_b, at + 1) - lane(u_a, at))
+                    down = quantum * downwards + (lane(u_a, at + 1) - lane(u_b, at))
+                    more, less = total * up + between * down, total * down + between * up
+                    longer, shorter = ti.max(more.norm(), TINY_LENGTH), ti.max(less.norm(), TINY_LENGTH)
+                    n, m = half * more / longer, half * less / shorter
+                    # Derivatives of e_s by the corners: of the upper right one, and of the lower right one.
+                    by_upper, by_lower = total * n - between * m, between * n - total * m
+                    weight = (w_a[at] + w_b[at + 1]) * by_upper.dot(by_upper)
+                    weight += (w_a[at + 1] + w_b[at]) * by_lower.dot(by_lower)
                     before = ti.select(is_first, 0.0, multiplier[at])
                     error = strength * half * (longer - shorter) + before
                     stiff = strength * weight
+                    acts = at < cells and at % 2 == way
                     change = ti.select(acts, -over_relaxed(stiff) * error / (stiff + 1.0), 0.0)
                     multiplier[at] = ti.select(acts, before + change, multiplier[at])
-                    rise_x[at], rise_y[at], rise_z[at] = change * r_x, change * r_y, change * r_z
-                    fall_x[at], fall_y[at], fall_z[at] = change * t_x, change * t_y, change * t_z
+                    set_lane(rise, at, change * by_upper)
+                    set_lane(fall, at, change * by_lower)
                 for at in range(LANES):
-                    a_x[at] -= w_a[at] * rise_x[at]
-                    a_y[at] -= w_a[at] * rise_y[at]
-                    a_z[at] -= w_a[at] * rise_z[at]
-                    b_x[at] -= w_b[at] * fall_x[at]
-                    b_y[at] -= w_b[at] * fall_y[at]
-                    b_z[at] -= w_b[at] * fall_z[at]
+                    add_to_lane(u_a, at, -w_a[at] * lane(rise, at))
+                    add_to_lane(u_b, at, -w_b[at] * lane(fall, at))
                 for at in range(LANES):
-                    a_x[at + 1] += w_a[at + 1] * fall_x[at]
-                    a_y[at + 1] += w_a[at + 1] * fall_y[at]
-                    a_z[at + 1] += w_a[at + 1] * fall_z[at]
-                    b_x[at + 1] += w_b[at + 1] * rise_x[at]
-                    b_y[at + 1] += w_b[at + 1] * rise_y[at]
-                    b_z[at + 1] += w_b[at + 1] * rise_z[at]
+                    add_to_lane(u_a, at + 1, w_a[at + 1] * lane(fall, at))
+                    add_to_lane(u_b, at + 1, w_b[at + 1] * lane(rise, at))
                 blocks.cell_multiplier[a] = multiplier
-                is_inner = k + 1 < grid.strips
-                keep_two_blocks(blocks.u_x, a, a_x, is_inner)
-                keep_two_blocks(blocks.u_y, a, a_y, is_inner)
-                keep_two_blocks(blocks.u_z, a, a_z, is_inner)
-                keep_two_blocks(blocks.u_x, b, b_x, is_inner)
-                keep_two_blocks(blocks.u_y, b, b_y, is_inner)
-                keep_two_blocks(blocks.u_z, b, b_z, is_inner)
+                is_inner = k + 1 < along.strips
+                keep_with_next(blocks.u, a, u_a, is_inner)
+                keep_with_next(blocks.u, b, u_b, is_inner)
+
+
+@large_kernel
+def measure_lines(
+    blocks: ti.template(), along: Lines, rest: ti.f32, quantum: ti.f32, strain: Blocks, is_short: ti.template()
+):
+    """Strains at the nodes of all lines along one direction, of the two springs there or the one, for the lines across:
+    in blocks of these.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for strip in range(along.strips):
+        turn(blocks.u, strip, along)
+        before = Block(0.0)
+        for k in range(along.length):
+            a = along.first + k * along.strips + strip
+            after = Block(0.0)
+            if k + 1 < along.length:
+                u_a, u_b = blocks.u[a], blocks.u[a + along.strips]
+                p_a, p_b = blocks.lattice[a], blocks.lattice[a + along.strips]
+                for at in range(LANES):
+                    d = quantum * ti.cast(lane(p_a, at) - lane(p_b, at), ti.f32) + (lane(u_a, at) - lane(u_b, at))
+                    after[at] = d.norm() / rest - 1.0
+            weight = ti.select(k == 0 or k + 1 == along.length, 1.0, 0.5)
+            other = along.other_first + strip * LANES * along.other_strips + k // LANES
+            for at in range(LANES):
+                strain[other + at * along.other_strips][k % LANES] = weight * (before[at] + after[at])
+            before = after
+
+
+@large_kernel
+def solve_lines(
+    blocks: ti.template(),
+    along: Lines,
+    stiffness: Floats,
+    rest: ti.f32,
+    quantum: ti.f32,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    multipliers: Blocks,
+    poisson: ti.f32,
+    across: Blocks,
+    is_short: ti.template(),
+):
+    """The threads along one direction exactly: the Thomas algorithm forth, then back, where nodes move.
+
+    `stiffness` is as of `bend_lines`, `rest` the length of a spring [m]; `multipliers` of the spring that leads on from
+    each node start at 0 if `is_first`; `across` are the strains at nodes along the other direction, if `poisson` is not
+    0.
+    """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for strip in range(along.strips):
+        turn(blocks.u, strip, along)
+        compliance = Block(0.0)
+        for at in range(LANES):
+            compliance[at] = 1.0 / (dt_squared * stiffness[strip * LANES + at])
+        n, inverse_pivot, solved = VectorBlock(0.0), Block(0.0), Block(0.0)
+        for k in range(along.length - 1):
+            a = along.first + k * along.strips + strip
+            b = a + along.strips
+            u_a, u_b, p_a, p_b = blocks.u[a], blocks.u[b], blocks.lattice[a], blocks.lattice[b]
+            w_a, w_b, multiplier = blocks.inverse_mass[a], blocks.inverse_mass[b], multipliers[a]
+            inverse_length, factor, shift = Block(0.0), Block(0.0), Block(0.0)
+            if poisson > 0.0:
+                shift = 0.5 * poisson * rest * (across[a] + across[b])
+            for at in range(LANES):
+                at_start = quantum * ti.cast(lane(p_a, at) - lane(p_b, at), ti.f32)
+                d = at_start + (lane(u_a, at) - lane(u_b, at))
+                length = ti.max(d.norm(), TINY_LENGTH)
+                direction = direction_of(at_start, d / length)
+                before = ti.select(is_first, 0.0, multiplier[at])
+                coupling = -w_a[at] * direction.dot(lane(n, at))  # n is of the spring before
+                lower = coupling * inverse_pivot[at]
+                pivot = 1.0 / (w_a[at] + w_b[at] + compliance[at] - coupling * lower)
+                solved[at] = (rest - shift[at] - length - compliance[at] * before - coupling * solved[at]) * pivot
+                inverse_pivot[at], factor[at] = pivot, lower
+                inverse_length[at], multiplier[at] = 1.0 / length, before
+                set_lane(n, at, direction)
+            blocks.n[a], blocks.change[a], blocks.factor[a] = n, solved, factor
+            blocks.inverse_length[a], multipliers[a] = inverse_length, multiplier
+        factor_after, change, largest = Block(0.0), Block(0.0), Block(0.0)
+        after = VectorBlock(0.0)  # the push of the spring after the node
+        for m in range(along.length - 1):
+            a = along.first + (along.length - 2 - m) * along.strips + strip
+            b = a + along.strips
+            u_b, n_a, w_a, w_b = blocks.u[b], blocks.n[a], blocks.inverse_mass[a], blocks.inverse_mass[b]
+            forward, factor, inverse_length = blocks.change[a], blocks.factor[a], blocks.inverse_length[a]
+            multiplier, tension = multipliers[a], Block(0.0)
+            for at in range(LANES):
+                own = forward[at] - factor_after[at] * change[at]
+                push = own * lane(n_a, at)
+                add_to_lane(u_b, at, w_b[at] * (lane(after, at) - push))
+                set_lane(after, at, push)
+                factor_after[at], change[at] = factor[at], own
+                multiplier[at] += own
+                tension[at] = tension_to_turn(-multiplier[at] * inverse_length[at], w_a[at] + w_b[at])
+                largest[at] = ti.max(largest[at], tension[at])
+            blocks.u[b], multipliers[a], blocks.tension[a] = u_b, multiplier, tension
+        head = along.first + strip
+        u_a, w_a = blocks.u[head], blocks.inverse_mass[head]
+        for at in range(LANES):
+            add_to_lane(u_a, at, w_a[at] * lane(after, at))
+        blocks.u[head] = u_a
+        blocks.is_taut[head] = ti.cast(largest.max() > 0.0, ti.i32)
+        turn_back(blocks.u, strip, along)
+
+
+@large_kernel
+def straighten_lines(blocks: ti.template(), along: Lines, is_short: ti.template()):
+    """Let tension turn with the threads along one direction, in strips with too much of it."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for strip in range(along.strips):
+        if blocks.is_taut[along.first + strip]:
+            turn(blocks.u, strip, along)
+            turn(blocks.predicted, strip, along)
+            straighten_strip(blocks, along.first + strip, along)
+            turn_back(blocks.u, strip, along)
+
+
+@func
+def straighten_strip(blocks: ti.template(), line: ti.i32, along: Lines):
+    """Solve (1 + w_i (t_i-1 + t_i)) e_i - w_i t_i-1 e_i-1 - w_i t_i e_i+1 = e~_i of LANES threads.
+
+    Forth, with what the head was moved by as the first row, and back; `n` and `factor` of a spring hold what is solved
+    at the node that it leads from.
+    """
+    moved, share, t_before = VectorBlock(0.0), Block(0.0), Block(0.0)
+    for k in range(along.length):
+        a = line + k * along.strips
+        u, predicted, w_a, t_after = blocks.u[a], blocks.predicted[a], blocks.inverse_mass[a], blocks.tension[a]
+        is_last = k + 1 == along.length
+        for at in range(LANES):
+            pull = w_a[at] * t_before[at]
+            t_before[at] = ti.select(is_last, 0.0, t_after[at])
+            onward = w_a[at] * t_before[at]
+            pivot = 1.0 / (1.0 + onward + pull * (1.0 - share[at]))
+            set_lane(moved, at, pivot * (lane(u, at) - lane(predicted, at) + pull * lane(moved, at)))
+            share[at] = pivot * onward
+        blocks.n[a], blocks.factor[a] = moved, share
+    e = VectorBlock(0.0)
+    for m in range(along.length):
+        a = line + (along.length - 1 - m) * along.strips
+        u, predicted, share_a = blocks.n[a], blocks.predicted[a], blocks.factor[a]
+        for at in range(LANES):
+            set_lane(e, at, lane(u, at) + share_a[at] * lane(e, at))
+            set_lane(u, at, lane(predicted, at) + lane(e, at))
+        blocks.u[a] = u

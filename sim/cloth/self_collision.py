@@ -17,6 +17,7 @@ from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision_kernels import lanes_of_pair, range_of_vectors
+from sim.core.arrays import on_device
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
@@ -50,6 +51,7 @@ class SelfCollision:
         thickness: the largest [m].
         mean_edge: at rest, of all cloths together [m]; how far lists reach.
         coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart. `longest_edge` of all.
+        meets: whether any elements may meet: of several cloths, or of one that collides with itself.
         searches: how many pairs of patches were searched since `begin_frame`, over the number of patches.
 
     Args:
@@ -59,8 +61,7 @@ class SelfCollision:
     def __init__(self, state: ClothState) -> None:
         self._patches = Patches(state.host)
         self._met = PatchPairs(self._patches)
-        self._rest = Rest(state.body, ti.Vector.ndarray(3, ti.f32, state.vertex_count))
-        self._rest.position.from_numpy(state.host.position.astype(np.float32))
+        self._rest = Rest(state.body, on_device(state.host.position))
         blocks = ElementBlocks(self._patches)
         self._blocks = PatchBlocks(self._patches.vertex_lists, blocks.triangles, blocks.edges)
         self._collides = ti.ndarray(ti.i32, len(state.names))
@@ -88,7 +89,7 @@ class SelfCollision:
 
         Lists are kept, unless thicknesses or flags have changed: no result depends on when they were made.
         """
-        self._searched = 0
+        self._searched, self._was_changed = 0, False
         thickness = copied(state.thickness)  # of each node, as pairs are listed with the distance that they keep
         listed_for = thickness.tobytes(), state.self_collision
         if listed_for != self._listed_for:
@@ -96,7 +97,8 @@ class SelfCollision:
             self.thickness = float(thickness.max())
             self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
             self.forget()
-        self._met.set_margin(self.thickness)
+        self.meets = len(state.names) > 1 or any(state.self_collision)
+        self._met.set_margin(self.thickness, fits=self.meets)
 
     @property
     def searches(self) -> float:
@@ -104,17 +106,23 @@ class SelfCollision:
         return self._searched / max(self._patches.count, 1)
 
     def look(self, state: ClothState) -> float:
-        """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
-        motion, holds = self._met.look(state, None if self._is_forgotten or self._is_outrun else self._ageing)
+        """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m].
+
+        0 where none may meet: that is asked of pairs alone.
+        """
+        is_aged = self.meets and not (self._is_forgotten or self._is_outrun)
+        motion, holds = self._met.look(state, self._ageing if is_aged else None)
         self._is_outrun |= not holds
-        return motion
+        return motion if self.meets else 0.0
 
     @property
     def _ageing(self) -> Ageing:
         """How pairs of patches are aged."""
         edge = self.mean_edge
         least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        return Ageing(self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due)
+        return Ageing(
+            self.thickness, least_skin, self.with_triangles.on_device.piece_due, self.of_edges.on_device.piece_due
+        )
 
     def warm_up(self) -> None:
         """Compile what carries lists over."""
@@ -124,7 +132,9 @@ class SelfCollision:
         self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
     ) -> list[int]:
         """See `PatchPairs.finish`."""
-        negligible = NEGLIGIBLE * self.thickness
+        if not (self.meets or is_changed or self._was_changed):
+            return [0, 0, 0]
+        self._was_changed, negligible = is_changed, NEGLIGIBLE * self.thickness
         return self._met.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
@@ -140,6 +150,8 @@ class SelfCollision:
             recovery: share of a missing distance that the substep gives back [-].
         """
         met, lists = self._met, (self.with_triangles, self.of_edges)
+        if not self.meets:
+            return
         if self._is_forgotten or self._is_outrun:
             keeps = met.meet(self.thickness, self.mean_edge, self._collides, keeps=not self._is_forgotten)
             for pairs in lists:

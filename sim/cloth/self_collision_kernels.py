@@ -16,7 +16,7 @@ from sim.cloth.bundles import (
     Two,
 )
 from sim.cloth.proximity import closest_on_edges, closest_on_triangle, distance_of_edges, distance_to_triangle, unit_or
-from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, least_displacement
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, append_contact, least_displacement
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
@@ -344,14 +344,11 @@ def look_at_pair(
             if is_inside and ti.abs(across.dot(n)) > ALONG_NORMAL * across.norm():
                 n = ti.math.sign(across.dot(n)) * unit_or(across, n)
             least = least_displacement(distance, keeps, recovery)
-            slot = ti.atomic_add(contacts.counter[0], 1)
-            if slot < contacts.capacity:
-                pushes = distance < keeps or n.dot(weight[1] * u1 + weight[2] * u2 + weight[3] * u3) < least
-                contacts.vertices[slot], contacts.weights[slot], contacts.normal[slot] = v, weight, n
-                contacts.floor[slot] = ti.select(pushes and keeps > 0.0, least, INACTIVE)
-                contacts.kind[slot] = EDGE_EDGE if ti.static(are_edges) else VERTEX_TRIANGLE
-                contacts.arm[slot] = zero
-                contacts.friction[slot] = ti.sqrt(surface.friction[v[0]] * surface.friction[v[2]])
+            pushes = distance < keeps or n.dot(weight[1] * u1 + weight[2] * u2 + weight[3] * u3) < least
+            floor = ti.select(pushes and keeps > 0.0, least, INACTIVE)
+            kind = EDGE_EDGE if ti.static(are_edges) else VERTEX_TRIANGLE
+            friction = ti.sqrt(surface.friction[v[0]] * surface.friction[v[2]])
+            append_contact(contacts, v, weight, n, floor, kind, zero, friction)
     return slack - distance
 
 

@@ -1,6 +1,6 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Protocol
 
@@ -27,9 +27,8 @@ from sim.cloth.parameters import (
 )
 from sim.cloth.pins import Pins
 from sim.cloth.rectangles import rectangles_in_rows
-from sim.cloth.row_air import RectangleAir
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import joined_cells, joined_springs, springs_of
+from sim.cloth.springs import joined, springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths
@@ -154,21 +153,17 @@ class ClothSolver:
             (number in in_rows, cloth.iterations or 0, cloth.substeps is None)
             for number, cloth in enumerate(self.parameters)
         ]
-        families = joined_springs([springs_of(sheet) for sheet in sheets], first_nodes, groups=groups)
-        self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
-        self._cells = [
-            DeviceCells(cells, cloth_of)
-            for cells, cloth_of in joined_cells([cells_of(sheet) for sheet in sheets], first_nodes, groups=groups)
-        ]
+        springs, cells = (
+            joined([elements_of(sheet) for sheet in sheets], first_nodes, groups=groups)
+            for elements_of in (springs_of, lambda sheet: [cells_of(sheet)])
+        )
+        self._springs = [DeviceSprings(*family) for family in springs]
+        self._cells = [DeviceCells(*family) for family in cells]
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
         self._totals = ClothTotals(self.state, self._springs, self._cells)
         self._frame_dt = 1.0 / frames_per_second
         self._is_short = is_short(self.state.vertex_count, NODE_NS)
         self.air = ClothAir(self.state)
-        self._rectangles_in_wind = {
-            number: RectangleAir(self.state, grid, int(host.first_node[number]), self.air.share)
-            for number, grid in rectangles_in_rows(host).items()
-        }
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
         self._time_s = 0.0
@@ -279,7 +274,7 @@ class ClothSolver:
         if self.load is not None:
             self.load.put_on(self.state, self.gravity, dt)
         self._integrator.accelerate(dt)
-        self._predict(dt)
+        self.air.predict(self.gravity, dt)
         self._pins.displace(self._time_s, dt)
         self._displace(dt)
         state = self.state
@@ -334,15 +329,6 @@ class ClothSolver:
         """Wait until the device has done all that it was asked to, as measurements of time need."""
         ti.sync()
 
-    def _predict(self, dt: float) -> None:
-        """Gravity and air: of rectangles in nothing but wind by rows, of all others by lists of triangles."""
-        air, gravity = self.air, self.gravity
-        in_rows = self._rectangles_in_wind if air.acts and not air.is_shared else {}
-        for rectangle in in_rows.values():
-            rectangle.predict(gravity, dt)
-        for cloths in _runs_without(in_rows, len(self.parameters)):
-            air.predict(cloths, gravity, dt)
-
     def _hold_pins(self) -> None:
         if self._pins.hold(self._time_s):
             self._asked_dt, self._free_dt = self._largest_dts()
@@ -361,8 +347,6 @@ class ClothSolver:
         self._refines = np.array([cloth.substeps is None for cloth in cloths])
         self._adapts = self._takes_turns & self._refines
         self.air.take_parameters(cloths)
-        for number, rectangle in self._rectangles_in_wind.items():
-            rectangle.take_parameters(cloths[number])
         self._mass = float(self.state.mass.to_numpy().sum(dtype=np.float64))
 
     def _largest_dts(self) -> tuple[float, float]:
@@ -483,9 +467,3 @@ class ClothSolver:
 
 _STATE = {"lattice": np.int32, "carry": np.float32, "velocity": np.float32, "elastic": np.float32}
 """Arrays of the state that a restart needs, each (n, 3)."""
-
-
-def _runs_without(left_out: Collection[int], count: int) -> list[range]:
-    """The numbers 0 ... count - 1 but some, in runs of neighbours."""
-    ends = [-1, *sorted(left_out), count]
-    return [range(a + 1, b) for a, b in pairwise(ends) if b > a + 1]

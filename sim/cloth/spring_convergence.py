@@ -66,11 +66,7 @@ def measure_excess(
 @kernel
 def measure_excess_in_lines(
     multipliers: Blocks,
-    turned: ti.i32,
     along: Lines,
-    first_node: ti.i32,
-    node_step: ti.i32,
-    line_step: ti.i32,
     stiffness: Floats,
     rest: ti.f32,
     poisson: ti.f32,
@@ -82,10 +78,7 @@ def measure_excess_in_lines(
 
     Args:
         multipliers: from `solve_lines`, and at the same places.
-        turned: first turned block.
         along: the lines.
-        first_node: of the rectangle.
-        node_step, line_step: from a node to the next one of its line, and to the same of the next line.
         stiffness: of the springs of each line [N/m].
         rest: length of a spring [m].
         poisson: Poisson's ratio [-].
@@ -97,16 +90,14 @@ def measure_excess_in_lines(
     largest, unconverged = 0.0, 0.0
     for line in range(along.count):
         for k in range(along.length - 1):
-            block = line // LANES + k * along.strips
-            if along.is_turned:
-                block += turned
-            i = first_node + line * line_step + k * node_step
+            block = along.first + line // LANES + k * along.strips
+            i = along.first_node + line * along.line_step + k * along.node_step
             multiplier = multipliers[block][line % LANES]
             shift = 0.0
             if poisson > 0.0:
                 after = block + along.strips
                 shift = 0.5 * poisson * rest * (across[block][line % LANES] + across[after][line % LANES])
-            excess = excess_of(i, i + node_step, rest, shift, stiffness[line], multiplier, nodes, dt_squared)
+            excess = excess_of(i, i + along.node_step, rest, shift, stiffness[line], multiplier, nodes, dt_squared)
             largest = ti.max(largest, excess)
             if excess > LARGEST_RESIDUAL:
                 unconverged += 1.0

@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.cloth.cells import Cells
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet, triangle_areas
 
@@ -78,6 +77,11 @@ class Springs:
     def arity(self) -> int:
         """Nodes of each spring."""
         return int(self.nodes.shape[1])
+
+    @property
+    def family(self) -> tuple[int, bool]:
+        """Springs are solved in the order of this, those that share it together."""
+        return -self.arity, self.in_segments
 
     def stiffness(self, cloth: ClothParameters) -> Floats:
         """k of each spring in a cloth [N/m], (m,)."""
@@ -228,59 +232,38 @@ def edges_of(triangles: Indices) -> Edges:
     return Edges(nodes.astype(np.int32), of_side.reshape(-1))
 
 
-def joined_springs(
-    parts: list[list[Springs]], node_offsets: list[int], *, groups: Sequence[Group] | None = None
-) -> list[tuple[Springs, Indices]]:
-    """Springs of several cloths, those that are solved alike together and sorted by colour, and the cloth of each.
+def joined(
+    parts: Sequence[Sequence[Any]], node_offsets: Sequence[int], *, groups: Sequence[Group] | None = None
+) -> list[tuple[Any, Indices]]:
+    """Springs or cells of several cloths, those that are solved alike together and sorted by colour; the cloth of each.
 
     Args:
-        parts: the springs of each cloth.
+        parts: the springs, or the cells, of each cloth.
         node_offsets: number of its first node.
         groups: which of each cloth; only springs of cloths of one are joined, those of all if omitted.
     """
-    families: dict[tuple[Group, int, bool], list[tuple[int, Springs]]] = {}
+    families: dict[tuple[Any, ...], list[tuple[int, Any]]] = {}
     for number, cloth in enumerate(parts):
-        for springs in cloth:
-            if len(springs):
-                key = (groups[number] if groups else (), -springs.arity, springs.in_segments)
-                families.setdefault(key, []).append((number, springs))
-    joined = []
+        for elements in cloth:
+            if len(elements):
+                key = (groups[number] if groups else (), *elements.family)
+                families.setdefault(key, []).append((number, elements))
+    found = []
     for key in sorted(families):
         moved, pieces = [], 0
-        for number, springs in families[key]:
-            segment = np.where(springs.segment < 0, -1, springs.segment + pieces).astype(np.int32)
-            pieces = max(pieces, int(segment.max()) + 1)
-            nodes = (springs.nodes + node_offsets[number]).astype(np.int32)
-            moved.append(replace(springs, nodes=nodes, segment=segment))
-        cloth_of = np.concatenate([_all(number, len(springs)) for number, springs in families[key]])
-        springs = _joined(moved)
-        order = np.argsort(springs.colour, kind="stable")
-        joined.append((_mapped(lambda array, rows=order: array[rows], springs), cloth_of[order]))
-    return joined
-
-
-def joined_cells(
-    parts: list[Cells], node_offsets: list[int], *, groups: Sequence[Group] | None = None
-) -> list[tuple[Cells, Indices]]:
-    """Cells of several cloths, those with as many nodes together and sorted by colour, and the cloth of each.
-
-    Args:
-        parts: the cells of each cloth.
-        node_offsets: number of its first node.
-        groups: as of `joined_springs`.
-    """
-    families: dict[tuple[Group, int], list[int]] = {}
-    for number, cells in enumerate(parts):
-        families.setdefault((groups[number] if groups else (), cells.arity), []).append(number)
-    joined = []
-    for key in sorted(families):
-        own = families[key]
-        moved = [replace(parts[n], nodes=(parts[n].nodes + node_offsets[n]).astype(np.int32)) for n in own]
-        cloth_of = np.concatenate([_all(number, len(parts[number])) for number in own])
-        cells = _joined(moved)
-        order = np.argsort(cells.colour, kind="stable")
-        joined.append((_mapped(lambda array, rows=order: array[rows], cells), cloth_of[order]))
-    return joined
+        for number, elements in families[key]:
+            nodes = (elements.nodes + node_offsets[number]).astype(np.int32)
+            changed = {"nodes": nodes}
+            if isinstance(elements, Springs):
+                segment = np.where(elements.segment < 0, -1, elements.segment + pieces).astype(np.int32)
+                pieces = max(pieces, int(segment.max()) + 1)
+                changed["segment"] = segment
+            moved.append(replace(elements, **changed))
+        cloth_of = np.concatenate([_all(number, len(elements)) for number, elements in families[key]])
+        whole = _joined(moved)
+        order = np.argsort(whole.colour, kind="stable")
+        found.append((_mapped(lambda array, rows=order: array[rows], whole), cloth_of[order]))
+    return found
 
 
 def _joined(parts: list[Any]) -> Any:

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from sim.cloth.parameters import ClothParameters, PinParameters, SphereRegion
 from sim.cloth.sheet import RestSheet, build_sheet
 from sim.core.domain import DomainParameters
+from sim.core.motion import rotation
+from sim.core.motion.paths import KeyframePath
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -118,6 +120,16 @@ def pins_of(cloth: ClothParameters) -> list[NDArray[np.int64]]:
     sheet = build_sheet(cloth.shape)
     position = start_positions(cloth, sheet)
     return [pinned_nodes(pin, sheet, position) for pin in cloth.pin]
+
+
+def path_of_pin(pin: PinParameters) -> KeyframePath:
+    """Offset and rotation of a pin that has keyframes, by time."""
+    return KeyframePath(
+        [keyframe.time_s for keyframe in pin.keyframe],
+        np.array([keyframe.offset for keyframe in pin.keyframe], dtype=np.float64),
+        np.stack([rotation.from_degrees(keyframe.rotation_deg) for keyframe in pin.keyframe]),
+        linear=pin.interpolation == "linear",
+    )
 
 
 def _nodes_in_region(pin: PinParameters, position: Floats) -> NDArray[np.int64]:

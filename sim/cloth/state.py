@@ -14,7 +14,8 @@ from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet
 from sim.cloth.springs import edges_of
 from sim.cloth.start import quantum_of, start_positions
-from sim.core.arrays import Vectors
+from sim.core.arrays import Vectors, on_device
+from sim.core.bundles import with_room
 from sim.core.host_access import copied
 from sim.core.launch import kernel
 
@@ -135,28 +136,17 @@ class ClothState:
         self.host = host
         self.quantum = quantum_of(reach)
         self.limit = int(reach / self.quantum)
-        self.lattice = ti.Vector.ndarray(3, ti.i32, n)
-        self.position = ti.Vector.ndarray(3, ti.f32, n)
-        self.carry = ti.Vector.ndarray(3, ti.f32, n)
-        self.displacement = ti.Vector.ndarray(3, ti.f32, n)
-        self.velocity = ti.Vector.ndarray(3, ti.f32, n)
+        self.nodes: Nodes = with_room(Nodes, n, quantum=self.quantum)
+        self.motion: NodeMotion = with_room(NodeMotion, n)
+        self.surface: Surface = with_room(Surface, n, displacement=self.nodes.displacement)
+        self.lattice, _, self.inverse_mass, self.displacement = self.nodes
+        self.carry, self.velocity = self.motion
+        self.position, _, self.thickness, self.friction = self.surface
         self.elastic = ti.Vector.ndarray(3, ti.f32, n)
-        self.elastic.fill(0.0)
         self.mass = ti.ndarray(ti.f32, n)
-        self.inverse_mass = ti.ndarray(ti.f32, n)
-        self.thickness = ti.ndarray(ti.f32, n)
-        self.friction = ti.ndarray(ti.f32, n)
-        self.body = ti.ndarray(ti.i32, n)
-        self.triangles = ti.Vector.ndarray(3, ti.i32, len(host.triangles))
-        self.edges = ti.Vector.ndarray(2, ti.i32, len(host.edges))
-        self.nodes = Nodes(self.lattice, self.quantum, self.inverse_mass, self.displacement)
-        self.motion = NodeMotion(self.carry, self.velocity)
-        self.surface = Surface(self.position, self.displacement, self.thickness, self.friction)
+        self.body, self.triangles, self.edges = on_device(host.body), on_device(host.triangles), on_device(host.edges)
         self.self_collision: tuple[bool, ...] = ()
         self.is_free: tuple[bool, ...] = ()
-        self.body.from_numpy(host.body)
-        self.triangles.from_numpy(host.triangles)
-        self.edges.from_numpy(host.edges)
         self.set_positions(host.position)
         self.velocity.from_numpy(host.velocity.astype(np.float32))
 

@@ -21,6 +21,9 @@ LEAST_BLOCK = 32
 STRAIGHTENED = 0.35
 """Part of what is more that turns with the springs: waves are stable from 1/4 on, and neither damped nor driven."""
 
+LEAST_WEIGHT = 1.0e-20
+"""Inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions."""
+
 LEAST_ALIKE = 0.995
 """Cosine of the angle that a spring may turn by in a step for its direction to be that of the start."""
 
@@ -42,7 +45,7 @@ class ThreadSolver:
     Newmark's implicit scheme.
 
     For GPUs: a block of their threads solves a piece by parallel cyclic reduction (Hockney 1965; Zhang, Cohen & Owens
-    2010, "Fast tridiagonal solvers on the GPU"), a row each. A CPU does the same in `row_threads`. Kernels here and in
+    2010, "Fast tridiagonal solvers on the GPU"), a row each. A CPU does the same in `row_springs`. Kernels here and in
     `xpbd` write x = x + y: what stands at an index from memory Taichi would add to by an atomic operation for +=.
     """
 
@@ -112,10 +115,7 @@ def direction_of(at_start, predicted):
 @ti.func
 def tension_to_turn(stress, weight):
     """What shall turn with a spring of a tension over its length; nothing if its nodes, of this `weight`, are held."""
-    excess = 0.0
-    if stress * weight > TURNED_EXPLICITLY:
-        excess = STRAIGHTENED * (stress - TURNED_EXPLICITLY / weight)
-    return excess
+    return STRAIGHTENED * ti.max(stress - TURNED_EXPLICITLY / ti.max(weight, LEAST_WEIGHT), 0.0)
 
 
 @func

@@ -14,7 +14,7 @@ from sim.cloth.device_springs import DeviceSprings, coefficient, separation
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Vectors
 from sim.core.launch import kernel
-from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced, runs_on_gpu
+from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced_tree, runs_on_gpu
 
 NODE_MAXIMA, NODE_SUMS = 1, 7
 SPRING_MAXIMA, SPRING_SUMS = 1, 1
@@ -49,35 +49,19 @@ class ClothTotals:
 
     def of_springs(self) -> dict[str, float]:
         """Elastic energy, and the largest strain along threads and triangles."""
-        state, energy, strain = self._state, 0.0, 0.0
+        state, found = self._state, []
         for springs in self._springs:
             springs.contract(state.nodes, state.carry)
-            results = self._of_springs.unpack(
-                sum_over_springs(
-                    springs.on_device,
-                    state.nodes,
-                    state.carry,
-                    springs.count,
-                    springs.arity,
-                    self._of_springs.over(springs.count),
-                )
+            share = self._of_springs.over(springs.count)
+            found.append(
+                sum_over_springs(springs.on_device, state.nodes, state.carry, springs.count, springs.arity, share)
             )
-            strain, energy = max(strain, float(results[0])), energy + float(results[1])
         for cells in self._cells:
             cells.measure_strains(state.nodes, state.motion, is_damped=False)
-            results = self._of_springs.unpack(
-                sum_over_cells(
-                    cells.on_device,
-                    cells.mesh,
-                    state.nodes,
-                    state.carry,
-                    cells.count,
-                    cells.arity,
-                    self._of_springs.over(cells.count),
-                )
-            )
-            strain, energy = max(strain, float(results[0])), energy + float(results[1])
-        return {"elastic_energy": energy, "max_strain": strain}
+            share, law = self._of_springs.over(cells.count), (cells.on_device, cells.mesh)
+            found.append(sum_over_cells(*law, state.nodes, state.carry, cells.count, cells.arity, share))
+        strains, energies = zip(*((float(each[0]), float(each[1])) for each in found), strict=True)
+        return {"elastic_energy": sum(energies), "max_strain": max(0.0, *strains)}
 
 
 @kernel
@@ -92,9 +76,10 @@ def sum_over_nodes(
     share: Share,
 ) -> Results:
     """Largest squared speed; momentum, kinetic and potential energy; how many are not finite, or at the ends."""
+    (tree,) = ti.static((share.tree,))
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
+    for lane in range(tree.lanes):
         fastest = 0.0
         momentum = ti.math.vec3(0.0)
         kinetic = 0.0
@@ -115,14 +100,14 @@ def sum_over_nodes(
                     bad += 1.0
                 if ti.abs(lattice[i]).max() >= limit:
                     lost += 1.0
-        share.tree.partial[lane] = fastest
+        tree.partial[lane] = fastest
         for axis in ti.static(range(3)):
-            share.tree.partial[(1 + axis) * share.tree.lanes + lane] = momentum[axis]
-        share.tree.partial[4 * share.tree.lanes + lane] = kinetic
-        share.tree.partial[5 * share.tree.lanes + lane] = potential
-        share.tree.partial[6 * share.tree.lanes + lane] = bad
-        share.tree.partial[7 * share.tree.lanes + lane] = lost
-    return reduced(share.tree.partial, share.tree.lanes, share.tree.quantities, share.tree.maxima, share.tree.nodes)
+            tree.partial[(1 + axis) * tree.lanes + lane] = momentum[axis]
+        tree.partial[4 * tree.lanes + lane] = kinetic
+        tree.partial[5 * tree.lanes + lane] = potential
+        tree.partial[6 * tree.lanes + lane] = bad
+        tree.partial[7 * tree.lanes + lane] = lost
+    return reduced_tree(tree)
 
 
 @kernel
@@ -130,9 +115,10 @@ def sum_over_springs(
     springs: SpringArrays, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
 ) -> Results:
     """Largest strain of springs with two nodes; elastic energy."""
+    (tree,) = ti.static((share.tree,))
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
+    for lane in range(tree.lanes):
         largest = 0.0
         energy = 0.0
         for k in range(share.items):
@@ -145,6 +131,6 @@ def sum_over_springs(
                 energy += 0.5 * springs.law[s][1] * error * (error + springs.shift[s])
                 if ti.static(arity == 2):
                     largest = ti.max(largest, error / springs.law[s][0])
-        share.tree.partial[lane] = largest
-        share.tree.partial[share.tree.lanes + lane] = energy
-    return reduced(share.tree.partial, share.tree.lanes, share.tree.quantities, share.tree.maxima, share.tree.nodes)
+        tree.partial[lane] = largest
+        tree.partial[tree.lanes + lane] = energy
+    return reduced_tree(tree)

@@ -2,14 +2,7 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import (
-    CellArrays,
-    Nodes,
-    Strains,
-    TriangleFrames,
-    TriangleSystem,
-    TriangleWork,
-)
+from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, TriangleSystem, TriangleWork
 from sim.cloth.cells import OWN_SHARE, TRIANGLE
 from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
 from sim.cloth.device_springs import TINY_LENGTH
@@ -18,7 +11,7 @@ from sim.cloth.spring_convergence import LARGEST_RESIDUAL
 from sim.cloth.state import ClothState
 from sim.cloth.threads import STRAIGHTENED, direction_of
 from sim.core.arrays import Floats, Vectors
-from sim.core.bundles import func
+from sim.core.bundles import func, with_room
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, LaneReduction, Results, Share, reduced_tree, runs_on_gpu
 from sim.core.scheduling import is_short
@@ -70,14 +63,13 @@ class TriangleSolver:
     def __init__(self, state: ClothState, cells: DeviceCells) -> None:
         self._state, self.cloths = state, cells.cloths
         count, n = cells.count, state.vertex_count
-
-        def vectors(size: int, length: int = 3) -> ti.Ndarray:
-            array = ti.Vector.ndarray(length, ti.f32, size)
-            array.fill(0.0)
-            return array
-
-        scalars = ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 1)
-        scalars.fill(0.0)
+        work = with_room(
+            TriangleWork,
+            n,
+            scalars=ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 1),
+            moment=ti.Vector.ndarray(4, ti.f32, cells.chunks),
+            shift=ti.Vector.ndarray(3, ti.f32, cells.pieces),
+        )
         self._system = TriangleSystem(
             count,
             cells.own,
@@ -85,17 +77,10 @@ class TriangleSolver:
             cells.pieces,
             cells.on_device,
             cells.mesh,
-            TriangleFrames(*(vectors(count) for _ in range(4)), vectors(count, 4)),
-            TriangleWork(
-                *(vectors(count) for _ in range(2)),
-                *(vectors(size, 2) for size in (count, n)),
-                *(vectors(n) for _ in range(8)),
-                scalars,
-                vectors(cells.chunks, 4),
-                vectors(cells.pieces),
-            ),
+            with_room(TriangleFrames, count),
+            work,
         )
-        self._expected = vectors(n, 2)
+        self._expected = ti.Vector.ndarray(2, ti.f32, n)
         self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
         self._short = is_short(count, TRIANGLE_NS) and is_short(cells.own, NODE_OF_MESH_NS)
         self._left = self._mass = self._least = 0.0
@@ -143,29 +128,31 @@ def stiffer(s: ti.i32, cells: CellArrays, rate: ti.f32) -> ti.f32:
 
 @func
 def strain(s: ti.i32, system: TriangleSystem, moved: Vectors, rate: ti.f32) -> ti.math.vec2:
-    """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `work`."""
-    d_u = change_of(system.cells.along, system.cells, moved, s)
-    d_v = change_of(system.cells.across, system.cells, moved, s)
-    n_u, n_v, turning = system.frames.n_u[s], system.frames.n_v[s], system.frames.turning[s]
-    by_u, by_v = system.frames.by_u[s], system.frames.by_v[s]
+    """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `frames`."""
+    cells, frames = ti.static((system.cells, system.frames))
+    d_u = change_of(cells.along, cells, moved, s)
+    d_v = change_of(cells.across, cells, moved, s)
+    n_u, n_v, turning = frames.n_u[s], frames.n_v[s], frames.turning[s]
+    by_u, by_v = frames.by_u[s], frames.by_v[s]
     e_u, e_v = n_u.dot(d_u), n_v.dot(d_v)
-    shear = stiffer(s, system.cells, rate) * system.cells.law[s][1] * (by_u.dot(d_u) + by_v.dot(d_v))
+    shear = stiffer(s, cells, rate) * cells.law[s][1] * (by_u.dot(d_u) + by_v.dot(d_v))
     more, less = ROOT_HALF * (by_u + by_v), ROOT_HALF * (by_v - by_u)
     d_more, d_less = d_u + d_v, d_u - d_v
     s_more = turning[2] * (d_more - more.dot(d_more) * more)
     s_less = turning[3] * (d_less - less.dot(d_less) * less)
-    system.work.s_u[s] = shear * by_u + turning[0] * (d_u - e_u * n_u) + (s_more + s_less)
-    system.work.s_v[s] = shear * by_v + turning[1] * (d_v - e_v * n_v) + (s_more - s_less)
+    frames.s_u[s] = shear * by_u + turning[0] * (d_u - e_u * n_u) + (s_more + s_less)
+    frames.s_v[s] = shear * by_v + turning[1] * (d_v - e_v * n_v) + (s_more - s_less)
     return ti.math.vec2(e_u, e_v)
 
 
 @func
 def stretch(s: ti.i32, system: TriangleSystem, rate: ti.f32):
-    """Add the forces by e_u and e_v to those in `work`."""
-    tension = tension_of(s, system.cells, system.mesh, system.mesh.strain, system.mesh.mean)
-    tension *= stiffer(s, system.cells, rate)
-    system.work.s_u[s] = system.work.s_u[s] + tension[0] * system.frames.n_u[s]
-    system.work.s_v[s] = system.work.s_v[s] + tension[1] * system.frames.n_v[s]
+    """Add the forces by e_u and e_v to those in `frames`."""
+    cells, mesh, frames = ti.static((system.cells, system.mesh, system.frames))
+    tension = tension_of(s, cells, mesh, mesh.strain, mesh.mean)
+    tension *= stiffer(s, cells, rate)
+    frames.s_u[s] = frames.s_u[s] + tension[0] * frames.n_u[s]
+    frames.s_v[s] = frames.s_v[s] + tension[1] * frames.n_v[s]
 
 
 @func
@@ -180,31 +167,33 @@ def change_of(coefficients: Floats, cells: CellArrays, vectors: Vectors, s: ti.i
 @func
 def gathered(k: ti.i32, system: TriangleSystem) -> ti.math.vec3:
     """Sum over the corners at a node of what the triangles' two forces are there [N]."""
+    cells, mesh, frames = ti.static((system.cells, system.mesh, system.frames))
     total = ti.math.vec3(0.0)
-    for at in range(system.mesh.start[k], system.mesh.start[k + 1]):
-        corner = system.mesh.corner[at]
+    for at in range(mesh.start[k], mesh.start[k + 1]):
+        corner = mesh.corner[at]
         s = corner // TRIANGLE
-        total += system.cells.along[corner] * system.work.s_u[s] + system.cells.across[corner] * system.work.s_v[s]
+        total += cells.along[corner] * frames.s_u[s] + cells.across[corner] * frames.s_v[s]
     return total
 
 
 @func
 def block(k: ti.i32, system: TriangleSystem, rate: ti.f32):
     """About the 3 x 3 block of K at a node [N/m]: means have a sixth of the stiffness on equal triangles."""
+    cells, mesh, frames = ti.static((system.cells, system.mesh, system.frames))
     total = ti.Matrix.zero(ti.f32, 3, 3)
     one = ti.Matrix.identity(ti.f32, 3)
-    for at in range(system.mesh.start[k], system.mesh.start[k + 1]):
-        corner = system.mesh.corner[at]
+    for at in range(mesh.start[k], mesh.start[k + 1]):
+        corner = mesh.corner[at]
         s = corner // TRIANGLE
-        u, v, turning = system.cells.along[corner], system.cells.across[corner], system.frames.turning[s]
-        along, shear = BLOCK_SHARE * system.cells.law[s][0], system.cells.law[s][1]
-        law = stiffer(s, system.cells, rate) * ti.math.vec2(along, shear)
-        n_u, n_v = u * system.frames.n_u[s], v * system.frames.n_v[s]
-        by = u * system.frames.by_u[s] + v * system.frames.by_v[s]
-        more = ROOT_HALF * (u + v) * (system.frames.by_u[s] + system.frames.by_v[s])
-        less = ROOT_HALF * (u - v) * (system.frames.by_v[s] - system.frames.by_u[s])
+        u, v, turning = cells.along[corner], cells.across[corner], frames.turning[s]
+        along, shear = BLOCK_SHARE * cells.law[s][0], cells.law[s][1]
+        law = stiffer(s, cells, rate) * ti.math.vec2(along, shear)
+        n_u, n_v = u * frames.n_u[s], v * frames.n_v[s]
+        by = u * frames.by_u[s] + v * frames.by_v[s]
+        more = ROOT_HALF * (u + v) * (frames.by_u[s] + frames.by_v[s])
+        less = ROOT_HALF * (u - v) * (frames.by_v[s] - frames.by_u[s])
         total += (law[0] - turning[0]) * n_u.outer_product(n_u) + (law[0] - turning[1]) * n_v.outer_product(n_v)
-        across = law[0] * system.cells.law[s][2]
+        across = law[0] * cells.law[s][2]
         total += across * (n_u.outer_product(n_v) + n_v.outer_product(n_u)) + law[1] * by.outer_product(by)
         total -= turning[2] * more.outer_product(more) + turning[3] * less.outer_product(less)
         round_about = turning[0] * u * u + turning[1] * v * v
@@ -222,68 +211,64 @@ def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.ve
 
 
 @kernel
-def linearize(
-    system: TriangleSystem,
-    nodes: Nodes,
-    carry: Vectors,
-    dt: ti.f32,
-    is_short: ti.template(),
-):
+def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32, is_short: ti.template()):
     """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
 
     Damping adds tau times the rate at which the prediction strains.
     """
+    cells, mesh, frames, work = ti.static((system.cells, system.mesh, system.frames, system.work))
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(system.count):
-        start_u = derivative(system.cells.along, system.cells, nodes, carry, s, TRIANGLE)
-        start_v = derivative(system.cells.across, system.cells, nodes, carry, s, TRIANGLE)
-        d_u = derivative(system.cells.along, system.cells, nodes, nodes.displacement, s, TRIANGLE)
-        d_v = derivative(system.cells.across, system.cells, nodes, nodes.displacement, s, TRIANGLE)
-        rate = system.cells.law[s][3] / dt
+        start_u = derivative(cells.along, cells, nodes, carry, s, TRIANGLE)
+        start_v = derivative(cells.across, cells, nodes, carry, s, TRIANGLE)
+        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
+        rate = cells.law[s][3] / dt
         length_u, length_v = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
         n_u, n_v = direction_of(start_u, d_u / length_u), direction_of(start_v, d_v / length_v)
         d_more, d_less, start_more, start_less = d_u + d_v, d_u - d_v, start_u + start_v, start_u - start_v
         more = direction_of(start_more, d_more / ti.max(d_more.norm(), TINY_LENGTH))
         less = direction_of(start_less, d_less / ti.max(d_less.norm(), TINY_LENGTH))
         by_u, by_v = ROOT_HALF * (more - less), ROOT_HALF * (more + less)
-        system.frames.n_u[s], system.frames.n_v[s], system.frames.by_u[s], system.frames.by_v[s] = n_u, n_v, by_u, by_v
+        frames.n_u[s], frames.n_v[s], frames.by_u[s], frames.by_v[s] = n_u, n_v, by_u, by_v
         moved_u, moved_v = d_u - start_u, d_v - start_v
         e = ti.math.vec2(length_u - 1.0, length_v - 1.0)
-        system.mesh.strain[s] = e + rate * ti.math.vec2(n_u.dot(moved_u), n_v.dot(moved_v))
+        mesh.strain[s] = e + rate * ti.math.vec2(n_u.dot(moved_u), n_v.dot(moved_v))
         shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v))
-        shear *= system.cells.law[s][1]
-        system.work.s_u[s], system.work.s_v[s] = shear * by_u, shear * by_v
+        shear *= cells.law[s][1]
+        frames.s_u[s], frames.s_v[s] = shear * by_u, shear * by_v
         length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
-        system.work.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
+        frames.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
         lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
-        pull = ROOT_HALF * system.cells.law[s][1] * shear_of(start_u, start_v)[0]
-        system.frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
+        pull = ROOT_HALF * cells.law[s][1] * shear_of(start_u, start_v)[0]
+        frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        system.mesh.mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.mesh.strain)
-        system.work.start_mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.work.start)
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+        work.start_mean[mesh.node[k]] = mean_strain(k, mesh, frames.start)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(system.count):
-        tension = tension_of(s, system.cells, system.mesh, system.work.start, system.work.start_mean)
-        system.frames.turning[s] = ti.max(system.frames.turning[s] * ti.math.vec4(tension, 1.0, 1.0), 0.0)
+        tension = tension_of(s, cells, mesh, frames.start, work.start_mean)
+        frames.turning[s] = ti.max(frames.turning[s] * ti.math.vec4(tension, 1.0, 1.0), 0.0)
         stretch(s, system, 0.0)
-        system.work.s_u[s], system.work.s_v[s] = dt * dt * system.work.s_u[s], dt * dt * system.work.s_v[s]
+        frames.s_u[s], frames.s_v[s] = dt * dt * frames.s_u[s], dt * dt * frames.s_v[s]
 
 
 @func
 def multiply(system: TriangleSystem, nodes: Nodes, dt: ti.f32, product: Vectors, is_short: ti.template()):
     """(M + dt² K) z of all nodes that are not held, else 0; for the outermost level of a kernel."""
+    mesh, work = ti.static((system.mesh, system.work))
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(system.count):
-        system.mesh.strain[s] = strain(s, system, system.work.z, 1.0 / dt)
+        mesh.strain[s] = strain(s, system, work.z, 1.0 / dt)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        system.mesh.mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.mesh.strain)
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(system.count):
@@ -291,29 +276,30 @@ def multiply(system: TriangleSystem, nodes: Nodes, dt: ti.f32, product: Vectors,
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        i = system.mesh.node[k]
+        i = mesh.node[k]
         w_i = nodes.inverse_mass[i]
         total = ti.math.vec3(0.0)
         if w_i > 0.0:
-            total = system.work.z[i] / w_i + dt * dt * gathered(k, system)
+            total = work.z[i] / w_i + dt * dt * gathered(k, system)
         product[i] = total
 
 
 @func
 def sum_products(system: TriangleSystem, product: Vectors, share: Share):
     """z.r and z.A z, for the `product` A z; for the outermost level of a kernel."""
+    tree, work = ti.static((share.tree, system.work))
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
+    for lane in range(tree.lanes):
         of_rest, of_product = 0.0, 0.0
         for k in range(share.items):
             n = lane * share.lane_step + k * share.item_step
             if n < system.own:
                 i = system.mesh.node[n]
-                of_rest += system.work.z[i].dot(system.work.r[i])
-                of_product += system.work.z[i].dot(product[i])
-        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = of_rest, of_product
-    reduced_tree(share.tree)
+                of_rest += work.z[i].dot(work.r[i])
+                of_product += work.z[i].dot(product[i])
+        tree.partial[lane], tree.partial[tree.lanes + lane] = of_rest, of_product
+    reduced_tree(tree)
 
 
 @kernel
@@ -329,10 +315,11 @@ def begin_iteration(
     """Residual at the start, and inverse blocks; in the first solve of a step the start is a multiple of `elastic`, and
     that is 0 from there on.
     """
+    tree, mesh, work = ti.static((share.tree, system.mesh, system.work))
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        i = system.mesh.node[k]
+        i = mesh.node[k]
         w_i = nodes.inverse_mass[i]
         e_i, r_i = ti.math.vec3(0.0), ti.math.vec3(0.0)
         if w_i > 0.0:
@@ -342,67 +329,61 @@ def begin_iteration(
                 r_i -= e_i / w_i
             mass = 1.0 / w_i * ti.Matrix.identity(ti.f32, 3)
             inverse = (mass + dt * dt * block(k, system, 1.0 / dt)).inverse()
-            system.work.diagonal[i] = ti.math.vec3(inverse[0, 0], inverse[1, 1], inverse[2, 2])
-            system.work.off_diagonal[i] = ti.math.vec3(inverse[1, 2], inverse[0, 2], inverse[0, 1])
-        system.work.r[i] = r_i
-        system.work.z[i] = ti.select(is_first, e_i, 0.0)
+            work.diagonal[i] = ti.math.vec3(inverse[0, 0], inverse[1, 1], inverse[2, 2])
+            work.off_diagonal[i] = ti.math.vec3(inverse[1, 2], inverse[0, 2], inverse[0, 1])
+        work.r[i] = r_i
+        work.z[i] = ti.select(is_first, e_i, 0.0)
         elastic[i] = ti.select(is_first, 0.0, e_i)
-    multiply(system, nodes, dt, system.work.q, is_short)
-    sum_products(system, system.work.q, share)
+    multiply(system, nodes, dt, work.q, is_short)
+    sum_products(system, work.q, share)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        i = system.mesh.node[k]
-        work_done, energy = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
+        i = mesh.node[k]
+        work_done, energy = tree.nodes[0], tree.nodes[tree.lanes // BRANCHES]
         multiple = work_done / ti.max(energy, TINY_ENERGY)
         if k == 0:
-            system.work.scalars[0] = multiple * work_done
-        system.work.x[i] = multiple * system.work.z[i]
-        r_i = system.work.r[i] - multiple * system.work.q[i]
-        system.work.r[i] = r_i
-        system.work.z[i] = preconditioned(i, system.work, r_i)
-        system.work.p[i], system.work.q[i] = ti.math.vec3(0.0), ti.math.vec3(0.0)
+            work.scalars[0] = multiple * work_done
+        work.x[i] = multiple * work.z[i]
+        r_i = work.r[i] - multiple * work.q[i]
+        work.r[i] = r_i
+        work.z[i] = preconditioned(i, work, r_i)
+        work.p[i], work.q[i] = ti.math.vec3(0.0), ti.math.vec3(0.0)
 
 
 @kernel
-def iterate(
-    system: TriangleSystem,
-    nodes: Nodes,
-    dt: ti.f32,
-    first: ti.i32,
-    share: Share,
-    is_short: ti.template(),
-):
+def iterate(system: TriangleSystem, nodes: Nodes, dt: ti.f32, first: ti.i32, share: Share, is_short: ti.template()):
     """`ITERATIONS_AT_ONCE` iterations, from number `first` on: with z = B r, gamma = r.z, delta = z.A z,
 
     beta = gamma/gamma', alpha = gamma/(delta - beta gamma/alpha'), p = z + beta p, q = A z + beta q,
     x += alpha p, r -= alpha q.
     """
+    tree, work = ti.static((share.tree, system.work))
     for step in ti.static(range(ITERATIONS_AT_ONCE)):
-        multiply(system, nodes, dt, system.work.a_z, is_short)
-        sum_products(system, system.work.a_z, share)
+        multiply(system, nodes, dt, work.a_z, is_short)
+        sum_products(system, work.a_z, share)
         if ti.static(is_short):
             ti.loop_config(serialize=True)
         for k in range(system.own):
             i = system.mesh.node[k]
-            gamma, delta = share.tree.nodes[0], share.tree.nodes[share.tree.lanes // BRANCHES]
+            gamma, delta = tree.nodes[0], tree.nodes[tree.lanes // BRANCHES]
             beta, before = 0.0, 1.0
             if first + step > 0:
-                beta = gamma / ti.max(system.work.scalars[2 * (first + step) - 1], TINY_ENERGY)
-                before = system.work.scalars[2 * (first + step)]
+                beta = gamma / ti.max(work.scalars[2 * (first + step) - 1], TINY_ENERGY)
+                before = work.scalars[2 * (first + step)]
             alpha = 0.0
             if before > 0.0:
                 rest = delta - beta * gamma / before
                 alpha = ti.select(rest > 0.0, gamma / rest, 0.0)
             if k == 0:
-                system.work.scalars[2 * (first + step) + 1], system.work.scalars[2 * (first + step) + 2] = gamma, alpha
-            p_i = system.work.z[i] + beta * system.work.p[i]
-            q_i = system.work.a_z[i] + beta * system.work.q[i]
-            system.work.p[i], system.work.q[i] = p_i, q_i
-            system.work.x[i] = system.work.x[i] + alpha * p_i
-            r_i = system.work.r[i] - alpha * q_i
-            system.work.r[i] = r_i
-            system.work.z[i] = preconditioned(i, system.work, r_i)
+                work.scalars[2 * (first + step) + 1], work.scalars[2 * (first + step) + 2] = gamma, alpha
+            p_i = work.z[i] + beta * work.p[i]
+            q_i = work.a_z[i] + beta * work.q[i]
+            work.p[i], work.q[i] = p_i, q_i
+            work.x[i] = work.x[i] + alpha * p_i
+            r_i = work.r[i] - alpha * q_i
+            work.r[i] = r_i
+            work.z[i] = preconditioned(i, work, r_i)
 
 
 @kernel
@@ -421,87 +402,82 @@ def decrease(scalars: Floats, first: ti.i32, end: ti.i32) -> ti.math.vec2:
 @func
 def measure_displaced(system: TriangleSystem, nodes: Nodes, is_short: ti.template()):
     """Strains of triangles, then of nodes, where displacements lead; for the outermost level of a kernel."""
+    cells, mesh = ti.static((system.cells, system.mesh))
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for s in range(system.count):
-        d_u = derivative(system.cells.along, system.cells, nodes, nodes.displacement, s, TRIANGLE)
-        d_v = derivative(system.cells.across, system.cells, nodes, nodes.displacement, s, TRIANGLE)
-        system.mesh.strain[s] = ti.math.vec2(d_u.norm() - 1.0, d_v.norm() - 1.0)
+        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
+        mesh.strain[s] = ti.math.vec2(d_u.norm() - 1.0, d_v.norm() - 1.0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        system.mesh.mean[system.mesh.node[k]] = mean_strain(k, system.mesh, system.mesh.strain)
+        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
 
 
 @kernel
 def finish_iteration(
-    system: TriangleSystem,
-    nodes: Nodes,
-    elastic: Vectors,
-    expected: Strains,
-    is_short: ti.template(),
+    system: TriangleSystem, nodes: Nodes, elastic: Vectors, expected: Strains, is_short: ti.template()
 ):
     """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
     nodes are expected to have then.
     """
+    mesh, work = ti.static((system.mesh, system.work))
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for chunk in range(system.chunks):
         moment, mass = ti.math.vec3(0.0), 0.0
-        for k in range(system.mesh.chunk[chunk], system.mesh.chunk[chunk + 1]):
-            i = system.mesh.node[k]
+        for k in range(mesh.chunk[chunk], mesh.chunk[chunk + 1]):
+            i = mesh.node[k]
             w_i = nodes.inverse_mass[i]
             m_i = HELD
             if w_i > 0.0:
                 m_i = 1.0 / w_i
-            moment += m_i * system.work.x[i]
+            moment += m_i * work.x[i]
             mass += m_i
-        system.work.moment[chunk] = ti.math.vec4(moment, mass)
+        work.moment[chunk] = ti.math.vec4(moment, mass)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for piece in range(system.pieces):
         total = ti.math.vec4(0.0)
-        for chunk in range(system.mesh.first_chunk[piece], system.mesh.first_chunk[piece + 1]):
-            total += system.work.moment[chunk]
-        system.work.shift[piece] = ti.select(total[3] < HELD, total.xyz / total[3], 0.0)
+        for chunk in range(mesh.first_chunk[piece], mesh.first_chunk[piece + 1]):
+            total += work.moment[chunk]
+        work.shift[piece] = ti.select(total[3] < HELD, total.xyz / total[3], 0.0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        i = system.mesh.node[k]
+        i = mesh.node[k]
         if nodes.inverse_mass[i] > 0.0:
-            x_i = system.work.x[i] - system.work.shift[system.mesh.piece[k]]
+            x_i = work.x[i] - work.shift[mesh.piece[k]]
             elastic[i] = elastic[i] + x_i
             nodes.displacement[i] = nodes.displacement[i] + x_i
     measure_displaced(system, nodes, is_short)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for k in range(system.own):
-        expected[system.mesh.node[k]] = system.mesh.mean[system.mesh.node[k]]
+        expected[mesh.node[k]] = mesh.mean[mesh.node[k]]
 
 
 @kernel
 def measure_node_excess(
-    system: TriangleSystem,
-    nodes: Nodes,
-    expected: Strains,
-    share: Share,
-    is_short: ti.template(),
+    system: TriangleSystem, nodes: Nodes, expected: Strains, share: Share, is_short: ti.template()
 ) -> Results:
     """Largest excess of strain of nodes of triangles, as `spring_convergence` has it, and how many along warp and weft
     are beyond `LARGEST_RESIDUAL`.
     """
+    tree, mesh = ti.static((share.tree, system.mesh))
     measure_displaced(system, nodes, is_short)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
+    for lane in range(tree.lanes):
         largest, unconverged = 0.0, 0.0
         for k in range(share.items):
             n = lane * share.lane_step + k * share.item_step
             if n < system.own:
-                excess = system.mesh.mean[system.mesh.node[n]] - expected[system.mesh.node[n]]
+                excess = mesh.mean[mesh.node[n]] - expected[mesh.node[n]]
                 largest = ti.max(largest, excess.x, excess.y)
                 for axis in ti.static(range(2)):
                     if excess[axis] > LARGEST_RESIDUAL:
                         unconverged += 1.0
-        share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, unconverged
-    return reduced_tree(share.tree)
+        tree.partial[lane], tree.partial[tree.lanes + lane] = largest, unconverged
+    return reduced_tree(tree)

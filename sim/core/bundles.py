@@ -43,6 +43,16 @@ def bundle(named_tuple: NamedTupleType) -> NamedTupleType:
     return named_tuple
 
 
+def with_room(kind: Any, places: int, **given: Any) -> Any:
+    """A bundle whose arrays have so many places, one at least, all of them 0, but for the fields that are given."""
+    return kind(
+        **{
+            field: given[field] if field in given else ti.ndarray(array.dtype, max(places, 1))
+            for field, array in kind.__bundled__.items()
+        }
+    )
+
+
 def is_bundle(kind: Any) -> bool:
     """Whether a type was made by `bundle`."""
     return hasattr(kind, "__bundled__")

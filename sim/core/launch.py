@@ -100,9 +100,10 @@ class FastKernel:
         TypeError: the kernel takes arguments of a type that it cannot pass.
     """
 
-    def __init__(self, kernel: Any) -> None:
+    def __init__(self, kernel: Any, *, is_large: bool = False) -> None:
         functools.update_wrapper(self, kernel)
         self._primal = kernel._primal
+        self._is_large = is_large
         self._kinds = getattr(self._primal.func, "__bundles__", (None,) * len(self._primal.arguments))
         self._program: Any = None
         self._compiled: dict[tuple[Any, ...], tuple[Any, Any, Tasks | None]] = {}
@@ -180,19 +181,24 @@ class FastKernel:
     def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
         """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
         flat = tuple(flattened(args))
-        began = time.perf_counter()
-        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
-        traced = time.perf_counter()
-        compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-        ended = time.perf_counter()
-        if ended - traced > SLOW_S:
-            for tell in _tell_compiled:
-                tell(self.__name__, ended - began)
-        tasks = None
-        if self._on_cuda:
-            result, tasks = tasks_of(self.__name__, lambda: self._primal(*flat))
-        else:
-            result = self._primal(*flat)
+        config, tasks = program.config(), None
+        optimizes = config.advanced_optimization
+        config.advanced_optimization = optimizes and not (self._is_large and self._on_cpu)
+        try:
+            began = time.perf_counter()
+            kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*flat)]
+            traced = time.perf_counter()
+            compiled = program.compile_kernel(config, program.get_device_caps(), kernel)
+            ended = time.perf_counter()
+            if ended - traced > SLOW_S:
+                for tell in _tell_compiled:
+                    tell(self.__name__, ended - began)
+            if self._on_cuda:
+                result, tasks = tasks_of(self.__name__, lambda: self._primal(*flat))
+            else:
+                result = self._primal(*flat)
+        finally:
+            config.advanced_optimization = optimizes
         if self._used_count != len(getattr(self._primal.func, "__used__", ())):
             self._compiled, self._launches = {}, {}  # their keys are of other arguments
             self._sort_arguments()
@@ -301,3 +307,11 @@ def _is_same(number: Any, before: Any) -> bool:
 def kernel(function: Callable[..., Any]) -> FastKernel:
     """Decorator in place of `ti.kernel`: the kernel may take bundles, and its launches are fast."""
     return FastKernel(ti.kernel(with_fields_as_arguments(function)))
+
+
+def large_kernel(function: Callable[..., Any]) -> FastKernel:
+    """As `kernel`, for one that takes seconds to compile: on a CPU LLVM alone optimizes it, in a quarter of the time.
+
+    Serial and parallel variants of its loops may differ in their last bits.
+    """
+    return FastKernel(ti.kernel(with_fields_as_arguments(function)), is_large=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.pin_paths import path_of_pin
+from sim.cloth.start import path_of_pin
 from sim.core.domain import DomainParameters
 from sim.core.motion import rotation
 from sim.core.parameters import Vector3

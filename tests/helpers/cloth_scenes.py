@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.solver import ClothSolver
 from sim.core.domain import DomainParameters
+from validation.sheet_energy import elastic_energy
 
 GRAVITY = 9.81
 EARTH = (0.0, 0.0, -GRAVITY)
@@ -61,7 +62,7 @@ def angular_momentum(solver: ClothSolver) -> NDArray[np.float64]:
 
 
 def spring_energy(solver: ClothSolver) -> float:
-    return sum(family.energy(solver.state.positions()) for family in (*solver._springs, *solver._cells))
+    return elastic_energy(solver, solver.state.positions())
 
 
 def energy(solver: ClothSolver) -> float:

@@ -60,9 +60,9 @@ def find(state: ClothState, pairs: SelfCollision) -> ContactList:
     """List pairs, and find contacts of cloth with cloth, as a substep does."""
     contacts = ContactList(10**5)
     while True:
-        contacts.counter.fill(0)
+        contacts.found.counter.fill(0)
         pairs.find(state, contacts, 0.1)
-        if not pairs.make_room_for(contacts.counter.to_numpy()[1:].tolist()):
+        if not pairs.make_room_for(contacts.found.counter.to_numpy()[1:].tolist()):
             return contacts
 
 
@@ -136,11 +136,11 @@ def point_triangle_distances(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> 
 
 def listed_places(pairs: SelfCollision, each: PairList) -> NDArray[np.int64]:
     """Places of a list where a pair of elements is, in the order of their pairs of patches."""
-    first, _, found, _ = each.pieces.to_numpy()[: pairs.patch_pairs.count].T
+    first, _, found, _ = each.on_device.pieces.to_numpy()[: pairs.patch_pairs.count].T
     return np.concatenate([np.arange(a, a + n) for a, n in zip(first, found, strict=True)])
 
 
 def listed_pairs(pairs: SelfCollision) -> list[list[tuple[int, ...]]]:
     """The pairs of elements in both lists, vertices with triangles first, in an order of their own."""
     lists = ((each, listed_places(pairs, each)) for each in (pairs.with_triangles, pairs.of_edges))
-    return [sorted(map(tuple, each.vertices.to_numpy()[places].tolist())) for each, places in lists]
+    return [sorted(map(tuple, each.on_device.pairs.to_numpy()[places].tolist())) for each, places in lists]

@@ -20,6 +20,7 @@ from validation.checks import CaseResult, Check, fitted_order
 from validation.crossing_triangles import crossings
 from validation.figures import SHADES, draw_refinement, label_axes, make_panels, plot_each
 from validation.scenes import EVERY_FACE, GRAVITY
+from validation.sheet_energy import elastic_energy
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
@@ -225,9 +226,7 @@ def _swinging_sheet(duration: float) -> dict[str, Any]:
             velocity = solver.state.velocity.to_numpy().astype(np.float64)
             positions = solver.state.positions() - 0.5 * dt * velocity
             moving = 0.5 * float(mass @ (velocity**2).sum(axis=1))
-            elastic = sum(each.energy(positions) for each in solver._springs) + sum(
-                each.energy(positions) for each in solver._cells
-            )
+            elastic = elastic_energy(solver, positions)
             times.append((step + 1) * dt)
             kinetic.append(moving / scale)
             energies.append((moving + elastic + GRAVITY * float(mass @ positions[:, 2])) / scale)

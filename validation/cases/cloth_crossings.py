@@ -277,7 +277,9 @@ def bodies_of(world: World) -> list[tuple[BodyGeometry, Points, Points]]:
         for contacts in cloth.contacts if isinstance(cloth, ClothSolver) else ():
             if isinstance(contacts, ContinuousContacts):
                 seen = contacts.rigid.bodies
-                places, turns = (each.to_numpy().astype(np.float64) for each in (seen.position, seen.rotation))
+                places, turns = (
+                    each.to_numpy().astype(np.float64) for each in (seen.colliding.position, seen.colliding.rotation)
+                )
                 found += list(zip(seen.geometries, places, turns, strict=False))
     return found
 

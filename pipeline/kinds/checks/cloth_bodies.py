@@ -12,7 +12,7 @@ from pipeline.kinds.checks.shapes import thin_wall_problem
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 from sim.cloth.parameters import PinParameters
-from sim.cloth.pin_paths import path_of_pin
+from sim.cloth.start import path_of_pin
 from sim.core.motion import rotation
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of

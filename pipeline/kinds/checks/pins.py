@@ -9,7 +9,7 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from sim.cloth.parameters import ClothParameters, substeps_of
-from sim.cloth.pin_paths import path_of_pin
+from sim.cloth.start import path_of_pin
 
 SOFTEST, FIRM = 1.0, 0.5
 """How far a sheet falls in a substep, times the nodes that each pinned one holds, over the spacing of nodes: springs at

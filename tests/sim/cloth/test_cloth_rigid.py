@@ -381,7 +381,8 @@ def test_vertices_alone_keep_a_ball_covered_that_would_show_by_little():
     contacts._find = lambda *arguments: counts.append(find(*arguments)) or counts[-1]
     for _ in range(15):
         world.advance_frame()
-    kinds, weights = (each.to_numpy()[: counts[-1]] for each in (contacts._contacts.kind, contacts._contacts.weights))
+    found = contacts._contacts.found
+    kinds, weights = (each.to_numpy()[: counts[-1]] for each in (found.kind, found.weights))
     assert np.count_nonzero(kinds == 0) > 100
     assert (weights[kinds == 0, 0] == 1.0).all()
     corners = solver.state.positions()[solver.state.host.triangles] - (0.0, 0.0, 0.1)

@@ -7,8 +7,9 @@ from cloth_scenes import cloth
 from sim.cloth.cells import TRIANGLE, cells_of
 from sim.cloth.parameters import RectangleSheet
 from sim.cloth.sheet import RestSheet, build_sheet, sheet_of_triangles
-from sim.cloth.springs import edges_of, greedy_colours, joined_cells, joined_springs, springs_of
+from sim.cloth.springs import edges_of, greedy_colours, joined, springs_of
 from sim.shapes.solid import ShapeError
+from validation.sheet_energy import cell_energies
 
 STIFFNESS = {"stretch_stiffness": 300.0, "shear_stiffness": 70.0, "bend_stiffness": 2.0e-3}
 
@@ -42,7 +43,7 @@ def elastic_energy(sheet: RestSheet, deform, **keys) -> float:
         stretch = np.linalg.norm(lever, axis=1) - springs.rest
         total += float((0.5 * springs.stiffness(parameters) * stretch**2).sum())
     cells = cells_of(sheet)
-    return total + float(cells.energies(positions, cells.law(parameters)).sum())
+    return total + float(cell_energies(cells, positions, cells.law(parameters)).sum())
 
 
 def rolled(curvature, angle=0.0):
@@ -88,7 +89,7 @@ def test_node_areas_sum_to_the_sheet():
 
 @pytest.mark.parametrize("sheet", [grid((9, 140)), equal_triangles()], ids=["rectangle", "mesh"])
 def test_springs_of_one_colour_share_no_node_unless_they_are_of_one_piece_of_thread(sheet):
-    families = joined_springs([springs_of(sheet), springs_of(sheet)], [0, len(sheet.vertices)])
+    families = joined([springs_of(sheet), springs_of(sheet)], [0, len(sheet.vertices)])
     assert sum(len(springs) for springs, _ in families) == 2 * sum(len(springs) for springs in springs_of(sheet))
     for springs, cloth_of in families:
         assert set(cloth_of) == {0, 1}
@@ -97,7 +98,7 @@ def test_springs_of_one_colour_share_no_node_unless_they_are_of_one_piece_of_thr
             own = springs.colour == colour
             pairs = np.unique(np.stack([springs.nodes[own].ravel(), np.repeat(block[own], springs.arity)]), axis=1)
             assert len(np.unique(pairs[0])) == pairs.shape[1]
-    for cells, _ in joined_cells([cells_of(sheet), cells_of(sheet)], [0, len(sheet.vertices)]):
+    for cells, _ in joined([[cells_of(sheet)], [cells_of(sheet)]], [0, len(sheet.vertices)]):
         assert len(cells) == 2 * len(cells_of(sheet))
         for colour in () if cells.arity == TRIANGLE else range(cells.colour.max() + 1):
             nodes = cells.nodes[cells.colour == colour].ravel()
@@ -105,7 +106,7 @@ def test_springs_of_one_colour_share_no_node_unless_they_are_of_one_piece_of_thr
 
 
 def test_springs_of_a_piece_of_thread_follow_one_another():
-    for springs, _ in joined_springs([springs_of(grid((9, 140)))], [0]):
+    for springs, _ in joined([springs_of(grid((9, 140)))], [0]):
         if springs.in_segments:
             same = springs.segment[1:] == springs.segment[:-1]
             np.testing.assert_array_equal(springs.nodes[1:][same, 0], springs.nodes[:-1][same, 1])

@@ -28,7 +28,7 @@ for frame in range(FRAMES):
     report = world.advance_frame()
     contacts = max(contacts, report.diagnostics["cloth"]["contacts"])
 assert contacts > 0.0
-assert ("begin_push" in {name for _, name in compiled})
+assert ("push" in {name for _, name in compiled})
 print([each for each in compiled if each[0] > 0])
 """
 

@@ -80,7 +80,7 @@ def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     assert met.age(state, Ageing(1.0, 0.0, *nothing_due(met))) == met.count
     assert met.count == patches.count * (patches.count + 1) // 2
     corners = pieces(patches.corners, patches.first_corner)
-    return met.approach.to_numpy()[: met.count], met.pairs.to_numpy()[: met.count], corners
+    return met.on_device.approach.to_numpy()[: met.count], met.on_device.pairs.to_numpy()[: met.count], corners
 
 
 def test_fitted_motion_bounds_how_much_nearer_points_of_patches_come():
@@ -203,7 +203,7 @@ def test_pairs_keep_a_changed_thickness_where_a_thicker_cloth_changes_nothing():
     assert pairs.thickness == np.float32(0.008)
     for each in (pairs.with_triangles, pairs.of_edges):
         places = listed_places(pairs, each)
-        vertices, wanted = each.vertices.to_numpy()[places], each.wanted.to_numpy()[places]
+        vertices, wanted = each.on_device.pairs.to_numpy()[places], each.on_device.wanted.to_numpy()[places]
         body = state.host.body[vertices]
         # What pairs keep is asked for when they are near: these are 1.1 mm apart, and a spacing or so aside.
         across = (wanted != UNKNOWN) & (body[:, 0] != body[:, 2])
@@ -225,8 +225,8 @@ def test_one_wild_vertex_has_only_its_own_surroundings_watched():
     assert finish(state, pairs, predicted) == [0, 1, 0]
     pairs.look(state)
     find(state, pairs)
-    allowed = pairs.patch_pairs.allowed.to_numpy()[: pairs.patch_pairs.count]
-    both = pairs.patch_pairs.pairs.to_numpy()[: pairs.patch_pairs.count]
+    allowed = pairs.patch_pairs.on_device.allowed.to_numpy()[: pairs.patch_pairs.count]
+    both = pairs.patch_pairs.on_device.pairs.to_numpy()[: pairs.patch_pairs.count]
     of_wild = np.isin(both, [m for m, corners in enumerate(corners_of(pairs)) if 0 in corners]).any(axis=1)
     assert 0 < np.count_nonzero(of_wild) < len(both) / 20
     np.testing.assert_allclose(allowed[~of_wild & (allowed > 0.0)], thickness, rtol=1e-6)
@@ -242,8 +242,8 @@ def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
     state = state_of(13)
     roomy, tight = SelfCollision(state), SelfCollision(state)
     for pairs, capacity in ((roomy, 10**5), (tight, 1)):
-        pairs.with_triangles._allocate(capacity)
-        pairs.of_edges._allocate(capacity)
+        pairs.with_triangles.resize(capacity)
+        pairs.of_edges.resize(capacity)
         crumple(state, pairs, 40)
     assert min(len(each) for each in listed_pairs(tight)) > 100
     assert listed_pairs(tight) == listed_pairs(roomy)
@@ -264,7 +264,10 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
         state.displacement.from_numpy(step.astype(np.float32))
         before = pairs.patch_pairs.count, pairs.searches
         pairs.look(state)
-        is_met, known = pairs._is_outrun and before[0] > 0, pairs.patch_pairs.slack.to_numpy()[: before[0]] > 0.0
+        is_met, known = (
+            pairs._is_outrun and before[0] > 0,
+            pairs.patch_pairs.on_device.slack.to_numpy()[: before[0]] > 0.0,
+        )
         find(state, pairs)
         if is_met:
             meetings += 1
@@ -285,7 +288,7 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
 def near_pairs(state, pairs: SelfCollision) -> list[tuple[int, ...]]:
     """What is found in the lists, in an order of its own."""
     contacts = find(state, pairs)
-    return sorted(map(tuple, contacts.vertices.to_numpy()[: contacts.counter.to_numpy()[0]].tolist()))
+    return sorted(map(tuple, contacts.found.vertices.to_numpy()[: contacts.found.counter.to_numpy()[0]].tolist()))
 
 
 def test_patches_are_searched_anew_only_where_cloth_moves():

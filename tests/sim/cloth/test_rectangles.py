@@ -54,7 +54,7 @@ def test_rows_and_lists_move_nodes_to_the_same_places(counts, iterations, poisso
     rows, lists = solver_of(parameters), by_lists(monkeypatch, parameters)
     for solver in (rows, lists):
         crumple(solver, slice(counts[0] // 2), spacing=spacing)
-        solver._predict(solver.stable_dt())
+        solver.air.predict(solver.gravity, solver.stable_dt())
     np.testing.assert_allclose(rows.state.velocity.to_numpy(), lists.state.velocity.to_numpy(), rtol=0.0, atol=1e-5)
     before = lists.state.displacement.to_numpy()
     np.testing.assert_allclose(rows.state.displacement.to_numpy(), before, rtol=0.0, atol=1e-8)
@@ -75,7 +75,7 @@ def test_tension_is_straightened_in_rows_as_in_lists(monkeypatch):
         positions = solver.state.positions() * (2.0, 2.0, 1.0)
         positions[:, 2] += 0.002 * np.sin(np.arange(len(positions)) % 90)
         solver.state.set_positions(positions)
-        solver._predict(solver.stable_dt())
+        solver.air.predict(solver.gravity, solver.stable_dt())
         solver._integrator.displace(solver.stable_dt(), np.ones(len(solver.parameters), dtype=int))
     assert lists._integrator._threads[0]._pieces.is_taut.to_numpy().any()
     moved = lists.state.displacement.to_numpy()

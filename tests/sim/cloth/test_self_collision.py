@@ -69,7 +69,7 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
     find(state, pairs)
     found, found_edges = listed_pairs(pairs)
     # A pair of patches is searched as far as its own motion asks for, to a thickness at least.
-    reach = pairs._met.reach.to_numpy()[: pairs._met.count].max()
+    reach = pairs._met.on_device.reach.to_numpy()[: pairs._met.count].max()
     assert reach < 0.1
     triangles = state.host.triangles
     vertex, triangle = (each.ravel() for each in np.mgrid[0:49, 0 : len(triangles)])
@@ -141,9 +141,9 @@ def test_the_plane_of_a_pair_is_between_both_however_near_they_are():
         pairs = SelfCollision(state)
         pairs.look(state)
         contacts = find(state, pairs)
-        count = contacts.counter.to_numpy()[0]
+        count = contacts.found.counter.to_numpy()[0]
         vertices, kinds, normals = (
-            each.to_numpy()[:count] for each in (contacts.vertices, contacts.kind, contacts.normal)
+            each.to_numpy()[:count] for each in (contacts.found.vertices, contacts.found.kind, contacts.found.normal)
         )
         met = [k for k in range(count) if kinds[k] == EDGE_EDGE and set(vertices[k]) == {0, 1, 4, 5}]
         assert len(met) == 1

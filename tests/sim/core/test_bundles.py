@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 
 from sim.core.arrays import Floats, Vectors
-from sim.core.bundles import bundle, func
+from sim.core.bundles import bundle, func, with_room
 from sim.core.launch import kernel
 
 
@@ -142,3 +142,13 @@ def test_fields_that_a_kernel_does_not_read_are_passed_to_none_of_its_launches(t
         np.testing.assert_array_equal(out.to_numpy(), 2.0)
         copy_one(Both(second, first), False, out)
         np.testing.assert_array_equal(out.to_numpy(), 2.0)
+
+
+@pytest.mark.usefixtures("taichi_cpu")
+def test_a_bundle_makes_arrays_of_its_types_but_for_what_it_is_given():
+    v = ti.Vector.ndarray(3, ti.f32, 7)
+    particles = with_room(Particles, 5, v=v)
+    assert particles.v is v
+    assert particles.x.to_numpy().shape == (5, 3)
+    assert particles.m.to_numpy().tolist() == 5 * [0.0]
+    assert with_room(Particles, 0).m.shape == (1,)  # kernels need one

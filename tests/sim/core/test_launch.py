@@ -4,7 +4,7 @@ import taichi as ti
 from taichi.lang import impl
 
 from sim.core import cuda_launch
-from sim.core.launch import LAUNCHES_BEFORE_GRAPH, MOST_LAUNCHES, FastKernel, kernel, on_compiled
+from sim.core.launch import LAUNCHES_BEFORE_GRAPH, MOST_LAUNCHES, FastKernel, kernel, large_kernel, on_compiled
 
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 AnyNumbers = ti.types.ndarray(ndim=1)
@@ -39,6 +39,20 @@ def ends(numbers: Floats, count: ti.i32) -> Pair:
 def halve(numbers: AnyNumbers):
     for i in range(numbers.shape[0]):
         numbers[i] = numbers[i] / 2
+
+
+optimized: list[bool] = []
+
+
+def note_optimization() -> float:
+    optimized.append(impl.current_cfg().advanced_optimization)
+    return 0.0
+
+
+@large_kernel
+def quarter(numbers: Floats):
+    for i in range(numbers.shape[0]):
+        numbers[i] = 0.25 * numbers[i] + ti.static(note_optimization())
 
 
 @kernel
@@ -180,3 +194,13 @@ def test_a_kernel_that_is_compiled_is_told_once(taichi_cpu, monkeypatch):
         on_compiled(None)
     double(ti.ndarray(ti.f32, 4))
     assert told == [("double", True)]
+
+
+def test_a_large_kernel_is_compiled_without_taichis_optimizations_on_a_cpu(taichi_cpu):
+    numbers = ti.ndarray(ti.f32, 3)
+    numbers.from_numpy(np.array([4.0, 8.0, 12.0], dtype=np.float32))
+    for _ in range(2):
+        quarter(numbers)
+    assert numbers.to_numpy().tolist() == [0.25, 0.5, 0.75]
+    assert optimized == [taichi_cpu != "cpu"]
+    assert impl.current_cfg().advanced_optimization  # of all others
