@@ -452,7 +452,7 @@ class Contacts(NamedTuple):
     kind: Integers
     arm: Vectors  # [m]
     friction: Floats  # [-]
-    counter: Integers  # (3,)
+    counter: Integers  # (5,)
     capacity: ti.i32
 
 

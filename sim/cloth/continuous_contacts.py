@@ -23,7 +23,7 @@ from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.core.host_access import copied
-from sim.core.reductions import LaneReduction
+from sim.core.reductions import LaneReduction, runs_on_gpu
 from sim.core.scheduling import is_short
 
 if TYPE_CHECKING:
@@ -69,22 +69,28 @@ class NearCloth(Protocol):
     def begin_frame(self, state: ClothState) -> None:
         """Expect of contacts what a run does that continues here."""
 
-    def look(self, state: ClothState) -> float:
-        """Note how cloth moves in this substep; returns a bound [m], which is not finite or huge after a blow-up."""
+    outcome: ti.Ndarray
+    """What `finish` answers, on the device."""
 
-    def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
+    def look(self, state: ClothState) -> None:
+        """Note how cloth moves in this substep."""
+
+    def looked(self) -> tuple[float, bool]:
+        """A bound of that [m], which is not finite or huge after a blow-up; and whether `find` could find all."""
+
+    def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """After `look`: append the pairs that are too near; `recovery` is the share of a missing distance that comes
-        back [-]."""
+        back [-]. If it `is_ahead` it does not wait for what `look` has found, and may find nothing."""
 
     def make_room_for(self, ends: Sequence[int]) -> bool:
         """Whether lists were too short for what `find` searched, so that it has to go on; now there is room."""
 
     def finish(
         self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
-    ) -> Sequence[int]:
+    ) -> Callable[[], Sequence[int]]:
         """Test so many contacts; if none of their pairs may have crossed, the substep is over.
 
-        Returns how many may have; whether contacts, if displacements are `changed` by them, displaced vertices farther
+        Asks how many may have; whether contacts, if displacements are `changed` by them, displaced vertices farther
         than allowed for, so that it is not over either; and whether any displacement is not finite.
         """
 
@@ -137,7 +143,8 @@ class ContinuousContacts:
         self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
-        self._meets_cloth, self._is_warm = False, False
+        self._meets_cloth, self._is_warm, self._expects = False, False, False
+        self._conclude: Callable[[ti.Ndarray], None] | None = None
         self._near: NearCloth = self._lone
         self.begin_frame()
 
@@ -146,7 +153,8 @@ class ContinuousContacts:
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
         n, first = state.vertex_count, state.host.first_node
-        velocity = box_of(state.velocity, 0, n, self._ends)
+        asked, self._velocities = self._velocities or box_of(state.velocity, 0, n, self._ends), None
+        velocity = asked()
         shortest = self.rigid.stable_dt(
             state,
             range(n),
@@ -156,7 +164,7 @@ class ContinuousContacts:
         if shortest == at_most or len(state.names) == 1:
             return shortest
         velocities, places = (
-            [box_of(vectors, *ends, self._ends) for ends in pairwise(first.tolist())]
+            [box_of(vectors, *ends, self._ends)() for ends in pairwise(first.tolist())]
             for vectors in (state.velocity, state.position)
         )
         shortest = at_most
@@ -189,6 +197,7 @@ class ContinuousContacts:
         self.rigid.set_thickness(float(copied(state.thickness).min()), self._near.thickness)
         self.rigid.bodies.begin_frame()
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
+        self._velocities: Callable[[], Box] | None = None
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())
 
@@ -221,11 +230,16 @@ class ContinuousContacts:
 
     # --- the substep ------------------------------------------------------------------------------------------------
 
-    def resolve(self, state: ClothState, dt: float, relax: Callable[[], bool]) -> None:
+    def resolve(
+        self,
+        state: ClothState,
+        dt: float,
+        relax: Callable[[], Callable[[], bool]],
+        conclude: Callable[[ti.Ndarray], None] | None = None,
+    ) -> bool:
         """Change the displacements of a substep of dt [s] so that nothing crosses; see `ClothContacts`."""
-        motion = self._near.look(state)
-        if not math.isfinite(motion) or motion > 1.0e6:
-            return  # the solver says which quantity is not finite, or ran away
+        self._conclude = conclude
+        self._near.look(state)
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
         self._nodes_as_one.fill(0.0)
@@ -233,12 +247,17 @@ class ContinuousContacts:
             self._warm_up(state)
             self._is_warm = True
         while True:
-            found = self._find(state, dt)
+            found, begun = self._find(state, dt, relax)
+            if found < 0:
+                self._contacts.forget()
+                self._velocities = None
+                return False  # the solver says which quantity is not finite, or ran away
             if found:
-                self._push(state, found, is_first=True, relax=relax)
+                self._push_in_turns(state, found, relax, begun)
             left, is_beyond, not_finite = self._keep_apart(state, found)
             if not_finite:
-                return  # as above
+                self._velocities = None
+                return False  # as above
             # What was pushed farther than foreseen may have met what was not looked at.
             if not is_beyond:
                 break
@@ -247,46 +266,80 @@ class ContinuousContacts:
         self._moved_as_one += self._nodes_as_one
         self._found += found
         self._left += left
+        self._expects = found > 0
+        return conclude is not None
 
     def _warm_up(self, state: ClothState) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
         for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
-            self._begin_push(state, 0, is_first=True, short=short)
+            self._begin_push(state, is_first=True, short=short)()
             self._push_on(0, 0, 0, short=short)
         if self._meets_cloth:
             self._pairs.warm_up()
 
-    def _find(self, state: ClothState, dt: float) -> int:
-        recovery = min(1.0, dt / RECOVERY_TIME_S)
+    def _find(
+        self, state: ClothState, dt: float, relax: Callable[[], Callable[[], bool]]
+    ) -> tuple[int, tuple[Callable[[], list[int]], Callable[[], bool]] | None]:
+        """Number of contacts, or -1 where cloth has no bounds; and a first round of pushes, where that has begun.
+
+        It has on a GPU, where there were contacts in the last substep: so the device need not wait for the host.
+        """
+        recovery, begun = min(1.0, dt / RECOVERY_TIME_S), None
+        is_ahead = self._expects and runs_on_gpu()
         while True:
-            self._near.find(state, self._contacts, recovery)
-            found, *ends = self.rigid.find(state, self._patches, self._near.motion, self._contacts, recovery)
+            if not is_ahead and not self._has_bounds():
+                return -1, None
+            self._near.find(state, self._contacts, recovery, is_ahead=is_ahead)
+            asked = self.rigid.find(state, self._patches, self._near.motion, self._contacts, recovery)
+            if is_ahead:
+                begun = self._begin_push(state, is_first=True, short=False), relax()
+                if not self._has_bounds():
+                    return -1, None
+                if not self._near.looked()[1]:
+                    continue
+            found, *ends = asked()
             is_short = self._near.make_room_for(ends)
             if not self._contacts.make_room_for(found) and not is_short:
-                return found
+                return found, begun
 
-    def _push(
-        self, state: ClothState, count: int, *, is_first: bool = False, relax: Callable[[], bool] = lambda: False
+    def _has_bounds(self) -> bool:
+        """Whether what was looked at moves within reason."""
+        motion, _ = self._near.looked()
+        return math.isfinite(motion) and motion <= 1.0e6
+
+    def _push_in_turns(
+        self,
+        state: ClothState,
+        count: int,
+        relax: Callable[[], Callable[[], bool]],
+        begun: tuple[Callable[[], list[int]], Callable[[], bool]] | None,
     ) -> None:
-        """Push; first in turns with the springs, for as long as these `relax`."""
-        short = self._is_short(count)
+        """Push in turns with the springs, for as long as these `relax`; the first round may have begun."""
+        short, is_first = self._is_short(count), True
         while True:
-            pushing, touched, is_missing, settled = self._begin_push(state, count, is_first=is_first, short=short)
-            self._iterations += STEPS if pushing else settled
-            if not (pushing or settled) or not relax():
+            pushed, go_on = begun or (self._begin_push(state, is_first=is_first, short=short), relax())
+            found = pushed()
+            pushing, _, _, settled = found
+            if not (pushing or settled) or not go_on():
                 break
-            is_first = False
+            self._iterations += STEPS if pushing else settled
+            is_first, begun = False, None
+        self._push_further(found, short=short)
+
+    def _push_further(self, found: Sequence[int], *, short: bool) -> None:
+        """More steps, where the round that `found` what `begin_push` returns was not enough."""
+        pushing, touched, is_missing, settled = found
+        self._iterations += STEPS if pushing else settled
         if pushing and is_missing:
             for step in range(0, MORE_ITERATIONS, STEPS):
                 self._push_on(pushing, touched, step, short=short)
             self._iterations += MORE_ITERATIONS
 
-    def _begin_push(self, state: ClothState, count: int, *, is_first: bool, short: bool) -> list[int]:
-        """A round of the first `STEPS` steps; what `begin_push` returns."""
+    def _begin_push(self, state: ClothState, *, is_first: bool, short: bool) -> Callable[[], list[int]]:
+        """A round of the first `STEPS` steps; asks for what `begin_push` returns."""
         contacts = self._contacts
-        found: list[int] = begin_push(
+        return begin_push.later(
             _momenta_from(0),
-            count,
             contacts.found,
             contacts.impulses(self._impulse_unit),
             state.vertex_count,
@@ -297,7 +350,6 @@ class ContinuousContacts:
             int(is_first),
             short,
         )
-        return found
 
     def _push_on(self, count: int, touched: int, first: int, *, short: bool) -> None:
         """More steps of the contact iteration, from step `first` of `MORE_ITERATIONS` on."""
@@ -322,7 +374,8 @@ class ContinuousContacts:
             if not found[0]:
                 return found
             self._repaired += found[0]
-            self._push(state, count)
+            short = self._is_short(count)
+            self._push_further(self._begin_push(state, is_first=False, short=short)(), short=short)
         found = self._finish(state, count)
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
@@ -338,7 +391,11 @@ class ContinuousContacts:
 
     def _finish(self, state: ClothState, count: int, *, is_changed: bool | None = None) -> Sequence[int]:
         is_changed = count > 0 if is_changed is None else is_changed
-        return self._near.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
+        asked = self._near.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
+        if self._conclude is not None:
+            self._conclude(self._near.outcome)
+            self._velocities = box_of(state.velocity, 0, state.vertex_count, self._ends)
+        return asked()
 
     def _is_short(self, count: int) -> bool:
         """Whether loops over so many contacts, and over all vertices, are."""

@@ -30,7 +30,6 @@ TOLERANCE = 0.02
 @kernel
 def begin_push(
     momenta: Momenta,
-    count: ti.i32,
     contacts: Contacts,
     impulses: Impulses,
     vertex_count: ti.i32,
@@ -41,12 +40,13 @@ def begin_push(
     is_first: ti.i32,
     is_short: ti.template(),
 ) -> ti.math.ivec4:
-    """A round of contacts in one launch: which of them push, some steps of the iteration, and where these lead.
+    """A round of the contacts that were found, in one launch: which of them push, some steps of the iteration, and
+    where these lead.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
     `TOLERANCE`, and whether any are settled.
     """
-    weigh_contacts(count, contacts, impulses, vertex_count, nodes, sums, bodies, is_first, is_short)
+    weigh_contacts(contacts.counter[3], contacts, impulses, vertex_count, nodes, sums, bodies, is_first, is_short)
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
     push_apart(momenta, 1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
     finish_push(1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)

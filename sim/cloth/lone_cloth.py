@@ -1,6 +1,6 @@
 """Cloth that meets no cloth: where its patches are and how they move, by which bodies and walls find it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import taichi as ti
 
@@ -29,6 +29,7 @@ class LoneCloth:
     Attributes:
         thickness: the largest [m].
         motion: of the patches in the substep, without turns.
+        outcome: see `NearCloth`.
 
     Args:
         state: the cloth.
@@ -43,7 +44,8 @@ class LoneCloth:
         self.motion.turn.fill(0.0)
         self._change, self._margin = floats(), floats()
         self._more = floats()  # `measure_change` writes it, for pairs of patches; nothing reads it here
-        self._taken, self._counter = ti.ndarray(ti.i32, 1), ti.ndarray(ti.i32, 3)
+        self._taken, self.outcome = ti.ndarray(ti.i32, 1), ti.ndarray(ti.i32, 3)
+        self.outcome.fill(0)
         self._maxima = LaneReduction(maxima=1, sums=0)
         self._is_short = is_short(patches.vertex_count, NODE_NS)
         self.begin_frame(state)
@@ -54,21 +56,23 @@ class LoneCloth:
         self._margin.fill(MARGIN * self.thickness)
         self._is_widened = True  # so that what contacts need is compiled in the first substep
 
-    def look(self, state: ClothState) -> float:
-        """Note where patches are and how they move in this substep; returns the largest displacement [m], or more."""
+    def look(self, state: ClothState) -> None:
+        """Note where patches are and how they move in this substep."""
         patches = self._patches
-        return float(
-            bound_patches(
-                self._maxima.over(patches.count),
-                patches.corner_lists,
-                state.position,
-                state.displacement,
-                self.motion,
-                self._is_short,
-            )
+        self._asked = bound_patches.later(
+            self._maxima.over(patches.count),
+            patches.corner_lists,
+            state.position,
+            state.displacement,
+            self.motion,
+            self._is_short,
         )
 
-    def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
+    def looked(self) -> tuple[float, bool]:
+        """The largest displacement [m], or more; and that there is nothing that `find` did not find."""
+        return float(self._asked()), True
+
+    def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """There is nothing to find."""
 
     def make_room_for(self, ends: Sequence[int]) -> bool:  # noqa: ARG002  (as `SelfCollision.make_room_for`)
@@ -83,26 +87,25 @@ class LoneCloth:
         count: int,  # noqa: ARG002
         *,
         is_changed: bool,
-    ) -> Sequence[int]:
+    ) -> Callable[[], Sequence[int]]:
         """As `SelfCollision.finish`: patches that bodies push far may have met others, or a wall."""
-        found: Sequence[int] = (0, 0, 0)
-        if is_changed or self._is_widened:
-            found = end_lone_contacts(
-                self._patches.corner_lists,
-                state.displacement,
-                predicted,
-                int(is_changed),
-                MARGIN * self.thickness,
-                self._change,
-                self._margin,
-                self._more,
-                self._counter,
-                is_changed * workers_for(self._patches.count),
-                self._taken,
-                self._is_short,
-            )
-        self._is_widened = is_changed
-        return found
+        is_asked, self._is_widened = is_changed or self._is_widened, is_changed
+        if not is_asked:
+            return lambda: (0, 0, 0)
+        return end_lone_contacts.later(
+            self._patches.corner_lists,
+            state.displacement,
+            predicted,
+            int(is_changed),
+            MARGIN * self.thickness,
+            self._change,
+            self._margin,
+            self._more,
+            self.outcome,
+            is_changed * workers_for(self._patches.count),
+            self._taken,
+            self._is_short,
+        )
 
 
 @kernel

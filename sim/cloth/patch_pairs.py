@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -185,6 +186,7 @@ class PatchPairs:
         slack: how much nearer elements of a pair may come that are not listed [m], (count,); `left` how much of it
             those may use up that are, until they are due.
         carried: numbers that pairs had before the last `meet`, or -1, (count,).
+        counters: of `look_at_patches` and `end_contacts`.
         reach: how far to search for the elements of each pair [m], (count,).
 
     Args:
@@ -201,7 +203,7 @@ class PatchPairs:
         self._tree = BoxTree(patches.leaves, *(ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2)))
         self._moving = MovingPatches(patches.corner_lists, self.bounds, self._budget)
         self._counter, self._taken = (ti.ndarray(ti.i32, 3) for _ in range(2))
-        self._counters = Counters(self._taken, self._counter)
+        self.counters = Counters(self._taken, self._counter)
         self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
         self.needed.fill(0)
@@ -246,10 +248,10 @@ class PatchPairs:
         self._budget.margin.fill(MARGIN * thickness)
         self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
-    def look(self, state: ClothState, ageing: Ageing | None = None) -> tuple[float, bool]:
+    def look(self, state: ClothState, ageing: Ageing | None = None) -> Callable[[], tuple[float, bool]]:
         """Note where patches are and how they move in this substep.
 
-        Returns how far vertices get apart from their common motion [m]; and whether the pairs of patches hold for this
+        Asks how far vertices get apart from their common motion [m]; and whether the pairs of patches hold for this
         substep, if they held before. If they are to be aged then, they have been.
 
         Args:
@@ -321,13 +323,13 @@ class PatchPairs:
             state: at the start of the substep.
             ageing: how; `PairList.piece_due` of both lists is `NEVER` after this where a pair is due.
         """
-        self._look(state, 0, ageing)
+        self._look(state, 0, ageing)()
         return self.expired_count
 
-    def _look(self, state: ClothState, vertex_count: int, ageing: Ageing | None) -> tuple[float, bool]:
+    def _look(self, state: ClothState, vertex_count: int, ageing: Ageing | None) -> Callable[[], tuple[float, bool]]:
         """Look at the patches unless there are no vertices, then age the pairs unless nothing is said about that."""
         patches = self.patches
-        motion, astray, expired, due = look_at_patches(
+        asked = look_at_patches.later(
             vertex_count,
             self._tracked(state),
             self._maxima.over(vertex_count),
@@ -337,13 +339,18 @@ class PatchPairs:
             self.on_device,
             ageing or Ageing(0.0, 0.0, self.left, self.left),
             (workers_for(patches.count) if vertex_count else 0, workers_for(self.count) if ageing else 0),
-            self._counters,
+            self.counters,
             self._is_short,
         )
-        if vertex_count:
-            self._astray = float(np.int32(astray).view(np.float32))
-        self.expired_count, self.due_count = max(int(expired), 0), int(due)
-        return float(np.int32(motion).view(np.float32)), expired >= 0
+
+        def answer() -> tuple[float, bool]:
+            motion, astray, expired, due = asked()
+            if vertex_count:
+                self._astray = float(np.int32(astray).view(np.float32))
+            self.expired_count, self.due_count = max(int(expired), 0), int(due)
+            return float(np.int32(motion).view(np.float32)), expired >= 0
+
+        return answer
 
     def finish(
         self,
@@ -354,11 +361,11 @@ class PatchPairs:
         negligible: float,
         *,
         is_changed: bool,
-    ) -> list[int]:
+    ) -> Callable[[], list[int]]:
         """Test contacts, and if all is well the substep is over: its motion is used up, and what contacts added to it.
 
         Where they displaced patches farther than allowed for, they may displace these half as far again from now on.
-        Returns what `end_contacts` does.
+        Asks for what `end_contacts` returns.
 
         Args:
             state: at the end of its displacements.
@@ -369,7 +376,7 @@ class PatchPairs:
             is_changed: whether contacts changed displacements.
         """
         patches, half = self.patches, self._half_thickness
-        found: list[int] = end_contacts(
+        return end_contacts.later(
             count,
             contacts.found,
             TestedContacts(contacts.impulse, state.inverse_mass, state.thickness, contacts.crossing),
@@ -380,7 +387,6 @@ class PatchPairs:
             SubstepEnd(int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
             self.on_device,
             (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
-            self._counters,
+            self.counters,
             self._is_short,
         )
-        return found

@@ -1,5 +1,6 @@
 """The contacts of a substep: what comes near what, and the least that their displacements must differ by."""
 
+import numpy as np
 import taichi as ti
 
 from sim.cloth.bundles import Contacts, Impulses
@@ -35,13 +36,18 @@ class ContactList:
         crossing: whether pairs may have crossed, (capacity,).
         used_by, use_weight: places of contacts in that order, and weights, vertex by vertex, (4 capacity,).
         found: what finding contacts writes, for kernels.
-        counter: number of contacts found, also those beyond the capacity; ends that lists of pairs need, (3,).
+        counter: number of contacts found, also those beyond the capacity; ends that lists of pairs need; number of
+            contacts that may push, 0 if what was found is not all; whether it is all of cloth with cloth, (5,).
     """
 
     def __init__(self, capacity: int) -> None:
-        self.counter = ti.ndarray(ti.i32, 3)
-        self.counter.fill(0)
+        self.counter = ti.ndarray(ti.i32, 5)
+        self.forget()
         self._allocate(capacity)
+
+    def forget(self) -> None:
+        """Nothing is found."""
+        self.counter.from_numpy(np.array([0, 0, 0, 0, 1], dtype=np.int32))
 
     def make_room_for(self, found: int) -> bool:
         """Whether so many contacts did not fit, so that they have to be found again; now there is room."""

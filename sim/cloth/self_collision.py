@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Ageing, Boxes, PairLists, PatchBlocks, PatchMotion, Rest
+from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, PatchMotion, Rest
 from sim.cloth.element_blocks import ElementBlocks
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.near_pairs import find_near_pairs
 from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
-from sim.cloth.self_collision_kernels import lanes_of_pair, range_of_vectors
+from sim.cloth.self_collision_kernels import range_of_vectors
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
@@ -76,7 +76,7 @@ class SelfCollision:
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
         self.thickness = 0.0
         self._listed_for: tuple[bytes, tuple[bool, ...]] = (b"", ())
-        self._is_forgotten, self._is_outrun, self._lacks_room = True, False, False
+        self._is_forgotten, self._is_outrun = True, False
         self.begin_frame(state)
 
     def forget(self) -> None:
@@ -103,11 +103,22 @@ class SelfCollision:
         """How often the elements of a patch were searched since `begin_frame`, on average."""
         return self._searched / max(self._patches.count, 1)
 
-    def look(self, state: ClothState) -> float:
-        """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
-        motion, holds = self._met.look(state, None if self._is_forgotten or self._is_outrun else self._ageing)
-        self._is_outrun |= not holds
-        return motion
+    def look(self, state: ClothState) -> None:
+        """Note how cloth moves in this substep."""
+        is_aged = not (self._is_forgotten or self._is_outrun)
+        self._asked = self._met.look(state, self._ageing if is_aged else None)
+        self._looked: tuple[float, bool] | None = None
+        self._is_searched = False
+
+    def looked(self) -> tuple[float, bool]:
+        """How far vertices get apart from their common motion [m]; and whether pairs of patches hold, so that `find`
+        could find all. Else it does when it is called again.
+        """
+        if self._looked is None:
+            self._looked = self._asked()
+            self._is_outrun |= not self._looked[1]
+            self._searched += self._met.expired_count
+        return self._looked
 
     @property
     def _ageing(self) -> Ageing:
@@ -122,12 +133,12 @@ class SelfCollision:
 
     def finish(
         self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
-    ) -> list[int]:
+    ) -> Callable[[], list[int]]:
         """See `PatchPairs.finish`."""
         negligible = NEGLIGIBLE * self.thickness
         return self._met.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
 
-    def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
+    def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.
 
         All pairs are listed first that vertices can bring within their thickness, or together, in this substep. Pairs
@@ -138,8 +149,11 @@ class SelfCollision:
             state: in a substep.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
+            is_ahead: not to wait for what `look` has found; if pairs of patches do not hold, nothing is appended.
         """
         met, lists = self._met, (self.with_triangles, self.of_edges)
+        if not is_ahead or self._is_forgotten or self._is_outrun:
+            self.looked()
         if self._is_forgotten or self._is_outrun:
             keeps = met.meet(self.thickness, self.mean_edge, self._collides, keeps=not self._is_forgotten)
             for pairs in lists:
@@ -148,19 +162,13 @@ class SelfCollision:
                 else:
                     pairs.set_pieces(met.capacity)
             self._is_forgotten = self._is_outrun = False
-            met.age(state, self._ageing)
-        count, lanes, patches = met.expired_count, lanes_of_pair(), self._patches
-        met.expired_count, self._searched = 0, self._searched + count
-        if not (count or met.due_count or self._lacks_room):
+            self._searched += met.age(state, self._ageing)
+            self._looked, self._is_searched = (self.looked()[0], True), False
+        if not (is_ahead or met.expired_count or met.due_count):
             return
         find_near_pairs(
-            (count, met.due_count, *(pairs.capacity for pairs in lists)),
-            (
-                workers_for(patches.count + count) if count else 0,
-                workers_for(2 * count * lanes) if count or self._lacks_room else 0,
-                workers_for(2 * met.due_count * lanes),
-            ),
-            self._taken,
+            (int(not self._is_searched), *(pairs.capacity for pairs in lists), workers_for(1)),
+            Counters(self._taken, met.counters.found),
             met.on_device,
             Boxes(met.bounds.low, met.bounds.high),
             self._blocks,
@@ -170,6 +178,7 @@ class SelfCollision:
             recovery,
             contacts.found,
         )
+        self._is_searched = True
 
     def make_room_for(self, ends: Sequence[int]) -> bool:
         """Whether the lists were too short for what was searched, so that `find` has to go on; now there is room.
@@ -178,8 +187,12 @@ class SelfCollision:
             ends: that they need, as `find` left them in the list of contacts.
         """
         lists = (self.with_triangles, self.of_edges)
-        self._lacks_room = True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
-        return self._lacks_room
+        return True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
+
+    @property
+    def outcome(self) -> ti.Ndarray:
+        """See `NearCloth`."""
+        return self._met.counters.found
 
     @property
     def motion(self) -> PatchMotion:
@@ -197,8 +210,8 @@ class SelfCollision:
         return self._met
 
 
-def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Box:
-    """Middle and half edges of the box around vectors, (3,) each, the same whatever their order.
+def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Callable[[], Box]:
+    """Asks for middle and half edges of the box around vectors, (3,) each, the same whatever their order.
 
     Args:
         vectors: of which those from `first` up to `end` are looked at, at least one.
@@ -206,6 +219,10 @@ def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) ->
         ends_of: of six maxima.
     """
     count = end - first
-    numbers = range_of_vectors(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
-    ends = ends_of.unpack(numbers).astype(np.float64)
-    return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])
+    asked = range_of_vectors.later(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
+
+    def answer() -> Box:
+        ends = ends_of.unpack(asked()).astype(np.float64)
+        return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])
+
+    return answer
