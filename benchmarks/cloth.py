@@ -25,7 +25,6 @@ from sim.scene import SceneParameters
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
-    from sim.cloth.state import ClothState
     from sim.core.world import World
 
 SIDE, HEIGHT = 1.0, 0.3
@@ -116,13 +115,14 @@ def seconds_of_contacts(world: World, solver: ClothSolver) -> float:
 
     spent, resolvers = [0.0], [contacts.resolve for contacts in solver.contacts]
 
-    def timed(resolve: Callable[..., None]) -> Callable[..., None]:
-        def resolve_timed(state: ClothState, dt: float, relax: Callable[[], bool]) -> None:
+    def timed(resolve: Callable[..., bool]) -> Callable[..., bool]:
+        def resolve_timed(*arguments: Any) -> bool:
             ti.sync()
             start = time.perf_counter()
-            resolve(state, dt, relax)
+            is_concluded = resolve(*arguments)
             ti.sync()
             spent[0] += time.perf_counter() - start
+            return is_concluded
 
         return resolve_timed
 

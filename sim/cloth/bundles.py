@@ -435,7 +435,7 @@ class Contacts(NamedTuple):
     kind: Integers  # `VERTEX_TRIANGLE`, `EDGE_EDGE`, `WALL`, or the number of a body
     arm: Vectors  # from the body's centre of mass to the point [m]
     friction: Floats  # Coulomb's coefficient [-]
-    counter: Integers  # (3,)
+    counter: Integers  # (5,)
     capacity: ti.i32
 
 

@@ -5,6 +5,7 @@ import taichi as ti
 from sim.cloth.bundles import Contacts, Impulses
 from sim.core.arrays import Floats, LongIntegers, Vectors
 from sim.core.bundles import func
+from sim.core.warps import add_to, largest_in_warp
 
 
 @func
@@ -48,6 +49,20 @@ def give_body(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered
     for axis in ti.static(range(3)):
         ti.atomic_add(body_gathered[6 * body + axis], -ti.round(push[axis], ti.i64))
         ti.atomic_add(body_gathered[6 * body + 3 + axis], -ti.round(twist[axis], ti.i64))
+
+
+@ti.func
+def give_body_together(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers, item: ti.i32):
+    """The same where all threads of a warp call it, for body -1 where there is none: one addition for most of them."""
+    common = largest_in_warp(body)
+    if body >= 0 and body != common:
+        give_body(push, body, arm, body_gathered)
+    if common >= 0:
+        own = ti.cast(body == common, ti.f32)
+        p, twist = own * push, own * arm.cross(push)
+        for axis in ti.static(range(3)):
+            add_to(body_gathered, 6 * common + axis, -ti.round(p[axis], ti.i64), item)
+            add_to(body_gathered, 6 * common + 3 + axis, -ti.round(twist[axis], ti.i64), item)
 
 
 @ti.func

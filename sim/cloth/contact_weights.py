@@ -3,11 +3,12 @@
 import taichi as ti
 
 from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, PushedNodes
-from sim.cloth.contact_answers import answered, body_mobility, give_body
+from sim.cloth.contact_answers import answered, body_mobility, give_body_together
 from sim.cloth.contact_supports import SHARES_PER_UNIT, answer_of, hold, support_between, turned_to_support
 from sim.cloth.proximity_contacts import INACTIVE, WALL
 from sim.core.bundles import func
 from sim.core.launch import kernel
+from sim.core.warps import whole_warps
 
 LEAST_FREE_WEIGHT = 0.05
 """A contact pushes only if its vertices that no pin holds have so much of its weight, so that none moves more than
@@ -19,7 +20,6 @@ ALONE = -1
 
 @kernel
 def weigh_contacts(
-    count: ti.i32,
     contacts: Contacts,
     impulses: Impulses,
     vertex_count: ti.i32,
@@ -46,7 +46,7 @@ def weigh_contacts(
     normal along that, from `held_sums`, `lever` and `pressing_body`.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end = count, vertex_count
+    contacts_end, vertices_end, weighed_end = contacts.counter[3], vertex_count, whole_warps(contacts.counter[3])
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
@@ -107,19 +107,21 @@ def weigh_contacts(
                 nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for c in range(contacts_end):
-        if impulses.mobility[c] > 0.0:
+    for c in range(weighed_end):
+        push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
+        if c < contacts_end and impulses.mobility[c] > 0.0:
             if is_first == 1:
                 impulses.impulse[c] = ti.math.vec3(0.0)
             v = contacts.vertices[c][0]
             if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
                 impulses.mobility[c] = nodes.inverse_mass[v]
-                settle(c, contacts, impulses, nodes, bodies)
+                push, body, arm = settle(c, contacts, impulses, nodes, bodies), contacts.kind[c], contacts.arm[c]
                 sums.counter[4] = 1
             else:
                 place = ti.atomic_add(sums.counter[0], 1)
                 impulses.pushing[place] = c
                 impulses.mobility[c] = weighed(c, place, contacts, impulses, nodes, sums, bodies)
+        give_body_together(push, body, arm, bodies.impulse, c)
 
 
 @func
@@ -162,12 +164,11 @@ def is_of_vertex_and_what_stands(c: ti.i32, contacts: Contacts, bodies: PushedBo
 
 
 @func
-def settle(c: ti.i32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies):
-    """Push the only vertex of a contact, which has no other, by all that it lacks."""
+def settle(c: ti.i32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies) -> ti.math.vec3:
+    """Push the only vertex of a contact, which has no other, by all that it lacks; returns that, in units."""
     v, before = contacts.vertices[c][0], impulses.impulse[c]
     after = answered(c, before, contacts, impulses, nodes.displacement, bodies.motion)
     push = (after - before) / impulses.unit
     impulses.impulse[c] = after
     nodes.displacement[v] += (nodes.inverse_mass[v] * impulses.unit) * ti.round(push)
-    if contacts.kind[c] >= 0:
-        give_body(push, contacts.kind[c], contacts.arm[c], bodies.impulse)
+    return push

@@ -24,7 +24,7 @@ from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.core.bundles import with_room
 from sim.core.host_access import copied
-from sim.core.reductions import LaneReduction
+from sim.core.reductions import LaneReduction, runs_on_gpu
 from sim.core.scheduling import is_short
 
 if TYPE_CHECKING:
@@ -96,7 +96,8 @@ class ContinuousContacts:
         self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
-        self._is_warm = False
+        self._is_warm = self._expects = False
+        self._conclude: Callable[[ti.Ndarray], None] | None = None
         self.begin_frame()
 
     # --- what the solver asks ---------------------------------------------------------------------------------------
@@ -104,7 +105,8 @@ class ContinuousContacts:
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
         n, first = state.vertex_count, state.host.first_node
-        velocity = box_of(state.velocity, 0, n, self._ends)
+        asked, self._velocities = self._velocities or box_of(state.velocity, 0, n, self._ends), None
+        velocity = asked()
         shortest = self.rigid.stable_dt(
             state,
             range(n),
@@ -114,7 +116,7 @@ class ContinuousContacts:
         if shortest == at_most or len(state.names) == 1:
             return shortest
         velocities, places = (
-            [box_of(vectors, *ends, self._ends) for ends in pairwise(first.tolist())]
+            [box_of(vectors, *ends, self._ends)() for ends in pairwise(first.tolist())]
             for vectors in (state.velocity, state.position)
         )
         shortest = at_most
@@ -144,6 +146,7 @@ class ContinuousContacts:
         self.rigid.set_thickness(float(copied(state.thickness).min()), self._pairs.thickness)
         self.rigid.bodies.begin_frame()
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
+        self._velocities: Callable[[], Box] | None = None
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())
 
@@ -176,11 +179,16 @@ class ContinuousContacts:
 
     # --- the substep ------------------------------------------------------------------------------------------------
 
-    def resolve(self, state: ClothState, dt: float, relax: Callable[[], bool]) -> None:
+    def resolve(
+        self,
+        state: ClothState,
+        dt: float,
+        relax: Callable[[], Callable[[], bool]],
+        conclude: Callable[[ti.Ndarray], None] | None = None,
+    ) -> bool:
         """Change the displacements of a substep of dt [s] so that nothing crosses; see `ClothContacts`."""
-        motion = self._pairs.look(state)
-        if not math.isfinite(motion) or motion > 1.0e6:
-            return  # the solver says which quantity is not finite, or ran away
+        self._conclude = conclude
+        self._pairs.look(state)
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
         self._nodes_as_one.fill(0.0)
@@ -188,12 +196,17 @@ class ContinuousContacts:
             self._warm_up(state)
             self._is_warm = True
         while True:
-            found = self._find(state, dt)
+            found, begun = self._find(state, dt, relax)
+            if found < 0:
+                self._contacts.forget()
+                self._velocities = None
+                return False  # the solver says which quantity is not finite, or ran away
             if found:
-                self._push(state, found, is_first=True, relax=relax)
+                self._push_in_turns(state, found, relax, begun)
             left, is_beyond, not_finite = self._keep_apart(state, found)
             if not_finite:
-                return  # as above
+                self._velocities = None
+                return False  # as above
             # What was pushed farther than foreseen may have met what was not looked at.
             if not is_beyond:
                 break
@@ -202,43 +215,77 @@ class ContinuousContacts:
         self._moved_as_one += self._nodes_as_one
         self._found += found
         self._left += left
+        self._expects = found > 0
+        return conclude is not None
 
     def _warm_up(self, state: ClothState) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
         for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
-            self._begin_push(state, 0, is_first=True, short=short)
+            self._begin_push(state, is_first=True, short=short)()
         if self._pairs.meets:
             self._pairs.warm_up()
 
-    def _find(self, state: ClothState, dt: float) -> int:
-        recovery = min(1.0, dt / RECOVERY_TIME_S)
+    def _find(
+        self, state: ClothState, dt: float, relax: Callable[[], Callable[[], bool]]
+    ) -> tuple[int, tuple[Callable[[], list[int]], Callable[[], bool]] | None]:
+        """Number of contacts, or -1 where cloth has no bounds; and a first round of pushes, where that has begun.
+
+        It has on a GPU, where there were contacts in the last substep: so the device need not wait for the host.
+        """
+        recovery, begun = min(1.0, dt / RECOVERY_TIME_S), None
+        is_ahead = self._expects and runs_on_gpu()
         while True:
-            self._pairs.find(state, self._contacts, recovery)
-            found, *ends = self.rigid.find(state, self._patches, self._pairs.motion, self._contacts, recovery)
+            if not is_ahead and not self._has_bounds():
+                return -1, None
+            self._pairs.find(state, self._contacts, recovery, is_ahead=is_ahead)
+            asked = self.rigid.find(state, self._patches, self._pairs.motion, self._contacts, recovery)
+            if is_ahead:
+                begun = self._begin_push(state, is_first=True, short=False), relax()
+                if not self._has_bounds():
+                    return -1, None
+                if not self._pairs.looked()[1]:
+                    continue
+            found, *ends = asked()
             is_short = self._pairs.make_room_for(ends)
             if not self._contacts.make_room_for(found) and not is_short:
-                return found
+                return found, begun
 
-    def _push(
-        self, state: ClothState, count: int, *, is_first: bool = False, relax: Callable[[], bool] = lambda: False
+    def _has_bounds(self) -> bool:
+        """Whether what was looked at moves within reason."""
+        motion, _ = self._pairs.looked()
+        return math.isfinite(motion) and motion <= 1.0e6
+
+    def _push_in_turns(
+        self,
+        state: ClothState,
+        count: int,
+        relax: Callable[[], Callable[[], bool]],
+        begun: tuple[Callable[[], list[int]], Callable[[], bool]] | None,
     ) -> None:
-        """Push; first in turns with the springs, for as long as these `relax`."""
-        short = self._is_short(count)
+        """Push in turns with the springs, for as long as these `relax`; the first round may have begun."""
+        short, is_first = self._is_short(count), True
         while True:
-            pushing, _, is_missing, settled = self._begin_push(state, count, is_first=is_first, short=short)
-            self._iterations += STEPS if pushing else settled
-            if not (pushing or settled) or not relax():
+            pushed, go_on = begun or (self._begin_push(state, is_first=is_first, short=short), relax())
+            found = pushed()
+            pushing, _, _, settled = found
+            if not (pushing or settled) or not go_on():
                 break
-            is_first = False
+            self._iterations += STEPS if pushing else settled
+            is_first, begun = False, None
+        self._push_further(state, found, short=short)
+
+    def _push_further(self, state: ClothState, found: Sequence[int], *, short: bool) -> None:
+        """More steps, where the round that `found` what `push` returns was not enough."""
+        pushing, _, is_missing, settled = found
+        self._iterations += STEPS if pushing else settled
         if pushing and is_missing:
             for step in range(0, MORE_ITERATIONS, STEPS):
                 self._push_on(state, step, finishes=step + STEPS >= MORE_ITERATIONS, short=short)
             self._iterations += MORE_ITERATIONS
 
-    def _begin_push(self, state: ClothState, count: int, *, is_first: bool, short: bool) -> list[int]:
-        """A round of the first `STEPS` steps; what `push` returns."""
+    def _begin_push(self, state: ClothState, *, is_first: bool, short: bool) -> Callable[[], list[int]]:
+        """A round of the first `STEPS` steps; asks for what `push` returns."""
         weigh_contacts(
-            count,
             self._contacts.found,
             self._contacts.impulses(self._impulse_unit),
             state.vertex_count,
@@ -250,9 +297,9 @@ class ContinuousContacts:
         )
         return self._push_on(state, 0, finishes=True, short=short)
 
-    def _push_on(self, state: ClothState, first: int, *, finishes: bool, short: bool) -> list[int]:
-        """Steps of the contact iteration, from step `first` on; what `push` returns."""
-        found: list[int] = push(
+    def _push_on(self, state: ClothState, first: int, *, finishes: bool, short: bool) -> Callable[[], list[int]]:
+        """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
+        return push.later(
             _momenta_from(first),
             int(first == 0),
             int(finishes),
@@ -264,7 +311,6 @@ class ContinuousContacts:
             self.rigid.bodies.pushed,
             short,
         )
-        return found
 
     def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
         """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""
@@ -273,7 +319,8 @@ class ContinuousContacts:
             if not found[0]:
                 return found
             self._repaired += found[0]
-            self._push(state, count)
+            short = self._is_short(count)
+            self._push_further(state, self._begin_push(state, is_first=False, short=short)(), short=short)
         found = self._finish(state, count)
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
@@ -289,7 +336,11 @@ class ContinuousContacts:
 
     def _finish(self, state: ClothState, count: int, *, is_changed: bool | None = None) -> Sequence[int]:
         is_changed = count > 0 if is_changed is None else is_changed
-        return self._pairs.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
+        asked = self._pairs.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
+        if self._conclude is not None:
+            self._conclude(self._pairs.outcome)
+            self._velocities = box_of(state.velocity, 0, state.vertex_count, self._ends)
+        return asked()
 
     def _is_short(self, count: int) -> bool:
         """Whether loops over so many contacts, and over all vertices, are."""

@@ -206,12 +206,12 @@ def solve_shears(
 ):
     """The cells of all colours, one after the other; if `is_first`, `SHEAR_SWEEPS` times, from multipliers of 0."""
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    bounds = colour_bounds(cell_of_colour, 0, colours)
-    ends = ti.Vector([bounds[k] + is_first * (bounds[k + 1] - bounds[k]) for k in ti.static(range(colours))])
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cell_of_colour, 0, colours, 1)
     for sweep in ti.static(range(SHEAR_SWEEPS)):
-        for k in ti.static(range(colours)):
-            for s in range(bounds[k], bounds[k + 1] if ti.static(sweep == 0) else ends[k]):
-                solve_shear(s, cells, nodes, dt_squared, is_first if ti.static(sweep == 0) else 0, multiplier)
+        for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
+            for s in range(begin, end):
+                if ti.static(sweep == 0) or is_first == 1:
+                    solve_shear(s, cells, nodes, dt_squared, is_first if ti.static(sweep == 0) else 0, multiplier)
 
 
 @func
@@ -241,9 +241,9 @@ def damp_shears(
 ):
     """The cells of so many colours, one colour after the other."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    bounds = colour_bounds(cell_of_colour, colour, colours)
-    for k in ti.static(range(colours)):
-        for s in range(bounds[k], bounds[k + 1]):
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cell_of_colour, colour, colours, 1)
+    for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
+        for s in range(begin, end):
             damp_shear(s, cells, nodes, motion, dt)
 
 

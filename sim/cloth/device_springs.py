@@ -141,9 +141,16 @@ def coefficient(springs: SpringArrays, s: ti.i32, arity: ti.template(), a: ti.te
 
 
 @ti.func
-def colour_bounds(piece_of_colour: Integers, first: ti.i32, colours: ti.template()):
-    """Where each of some colours begins, from `first` on, and where the last one ends."""
-    return ti.Vector([piece_of_colour[first + k] for k in ti.static(range(colours + 1))])
+def colour_bounds(piece_of_colour: Integers, first: ti.i32, colours: ti.template(), threads: ti.template()):
+    """Where each of some colours begins, from `first` on, and where the last one ends, times the threads of a piece;
+    the last as often as it takes for `MOST_COLOURS_AT_ONCE`.
+
+    For variables of their own: elements of a vector would be read between two loops, by a launch of its own on a GPU.
+    """
+    ti.static_assert(colours <= MOST_COLOURS_AT_ONCE, "more colours than are solved in one launch")
+    return threads * ti.Vector(
+        [piece_of_colour[first + ti.static(min(k, colours))] for k in ti.static(range(MOST_COLOURS_AT_ONCE + 1))]
+    )
 
 
 @func

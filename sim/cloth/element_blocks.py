@@ -50,16 +50,28 @@ def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Nda
 
 
 @func
-def enclose_elements(m: ti.i32, position: Vectors, of_edges: EdgeBlocks, of_triangles: TriangleBlocks):
-    """Midpoints of edges and half the vectors along them, and boxes of triangles, of a patch."""
-    for place in range(of_edges.first_block[m] * BLOCK, of_edges.first_block[m + 1] * BLOCK):
+def enclose_elements(
+    m: ti.i32,
+    lane: ti.i32,
+    lanes: ti.i32,
+    position: Vectors,
+    of_edges: EdgeBlocks,
+    of_triangles: TriangleBlocks,
+):
+    """Midpoints of edges and half the vectors along them, and boxes of triangles, of a patch, as one of several
+    threads.
+    """
+    place = of_edges.first_block[m] * BLOCK + lane
+    while place < of_edges.first_block[m + 1] * BLOCK:
         middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
         if of_edges.edges[place][0] != NONE:
             a, b = position[of_edges.edges[place][0]], position[of_edges.edges[place][1]]
             middle, half = 0.5 * (a + b), 0.5 * (b - a)
         of_edges.mid_x[place], of_edges.mid_y[place], of_edges.mid_z[place] = middle[0], middle[1], middle[2]
         of_edges.half_x[place], of_edges.half_y[place], of_edges.half_z[place] = half[0], half[1], half[2]
-    for place in range(of_triangles.first_block[m] * BLOCK, of_triangles.first_block[m + 1] * BLOCK):
+        place += lanes
+    place = of_triangles.first_block[m] * BLOCK + lane
+    while place < of_triangles.first_block[m + 1] * BLOCK:
         low, high = ti.math.vec3(FAR), ti.math.vec3(-FAR)
         corners = of_triangles.triangles[place]
         if corners[0] != NONE:
@@ -67,3 +79,4 @@ def enclose_elements(m: ti.i32, position: Vectors, of_edges: EdgeBlocks, of_tria
             low, high = ti.min(a, b, c), ti.max(a, b, c)
         of_triangles.low_x[place], of_triangles.low_y[place], of_triangles.low_z[place] = low[0], low[1], low[2]
         of_triangles.high_x[place], of_triangles.high_y[place], of_triangles.high_z[place] = high[0], high[1], high[2]
+        place += lanes

@@ -1,6 +1,6 @@
 """Springs as explicit forces: symplectic Euler, the reference mode, with the longest step that is stable."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import taichi as ti
@@ -51,9 +51,9 @@ class ExplicitSprings:
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
         """Springs hold their own stiffness."""
 
-    def excess(self, dt: float) -> NDArray[np.float64]:  # noqa: ARG002  (the integrators' protocol)
+    def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:  # noqa: ARG002  (the integrators' protocol)
         """None: springs are as long as their forces make them."""
-        return np.zeros(len(self._state.names))
+        return lambda: np.zeros(len(self._state.names))
 
     def diagnostics(self) -> Mapping[str, float]:
         """None of its own."""

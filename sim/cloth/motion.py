@@ -30,17 +30,26 @@ def move_pinned(
 
 @kernel
 def finish_step(
-    nodes: Nodes, motion: NodeMotion, position: Vectors, limit: ti.i32, dt: ti.f32, is_short: ti.template()
+    nodes: Nodes,
+    motion: NodeMotion,
+    position: Vectors,
+    limit: ti.i32,
+    dt: ti.f32,
+    reasons: Integers,
+    is_short: ti.template(),
 ):
     """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
 
     A velocity changes by what the displacement differs from dt times itself: the same as the displacement over dt, but
     for the rounding of 1/dt, which would make all velocities grow or shrink alike. Nodes stop at the ends of the
     lattice. Where a displacement is not finite, the velocity shows it.
+
+    Nothing is done unless the three `reasons` why the substep may not be over are 0.
     """
+    end = ti.select(reasons[0] + reasons[1] + reasons[2] == 0, position.shape[0], 0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for i in range(position.shape[0]):
+    for i in range(end):
         u_i = nodes.displacement[i]
         v_i = motion.velocity[i] + (u_i - (motion.carry[i] + dt * motion.velocity[i])) / dt
         for axis in ti.static(range(3)):
@@ -48,13 +57,13 @@ def finish_step(
                 quanta = ti.round(u_i[axis] / nodes.quantum)
                 rest = u_i[axis] - quanta * nodes.quantum
                 whole = ti.cast(ti.max(-LARGEST_MOVE, ti.min(quanta, LARGEST_MOVE)), ti.i32)
-                end = nodes.lattice[i][axis] + whole
-                if ti.abs(end) >= limit:
-                    end = ti.max(-limit, ti.min(end, limit))
+                place = nodes.lattice[i][axis] + whole
+                if ti.abs(place) >= limit:
+                    place = ti.max(-limit, ti.min(place, limit))
                     rest = 0.0
                     v_i[axis] = 0.0
-                nodes.lattice[i][axis] = end
-                position[i][axis] = ti.cast(end, ti.f32) * nodes.quantum
+                nodes.lattice[i][axis] = place
+                position[i][axis] = ti.cast(place, ti.f32) * nodes.quantum
                 motion.carry[i][axis] = rest
         motion.velocity[i] = v_i
         nodes.displacement[i] = motion.carry[i]

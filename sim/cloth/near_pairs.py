@@ -5,6 +5,7 @@ import taichi as ti
 from sim.cloth.bundles import (
     Boxes,
     Contacts,
+    Counters,
     PairLists,
     PatchBlocks,
     PatchPairArrays,
@@ -18,8 +19,8 @@ from sim.cloth.self_collision_kernels import (
     look_at_piece,
     pair_edges,
     pair_vertices_with_triangles,
+    parts_of_search,
 )
-from sim.core.arrays import Integers
 from sim.core.launch import large_kernel
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
@@ -31,8 +32,7 @@ ENCLOSED_AT_A_TIME, SEARCHED_AT_A_TIME, DUE_AT_A_TIME = 8, 1, 4
 @large_kernel
 def find_near_pairs(
     numbers: ti.math.ivec4,
-    workers: ti.math.ivec3,
-    taken: Integers,
+    counters: Counters,
     met: PatchPairArrays,
     boxes: Boxes,
     blocks: PatchBlocks,
@@ -56,8 +56,10 @@ def find_near_pairs(
     looked at.
 
     Args:
-        numbers: of pairs of patches that are searched, and that are due; most pairs of elements of both lists.
-        workers, taken: see `sim.core.scheduling`; for patches, for searches, and for pairs that are due.
+        numbers: whether to search, not if that is done, and only room was missing; most pairs of elements of both
+            lists; workers (`sim.core.scheduling`) of a CPU's loops that have anything to do.
+        counters: how many pairs of patches are expired, and due, and whether the list of them does not hold: then
+            nothing is done.
         met, boxes: all pairs of patches, of which `needed` is 0 after; where patches are.
         blocks: elements of the patches.
         lists: of vertices with triangles, and of edges; `again` gets the numbers of pieces that were too short.
@@ -66,56 +68,69 @@ def find_near_pairs(
         contacts: the list; its second and third number become the ends that both lists need.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    count, due_count, enclosing, searching, looking = numbers[0], numbers[1], workers[0], workers[1], workers[2]
     lanes = ti.static(lanes_of_pair())
+    parts = ti.static(parts_of_search())
+    threads = ti.static(lanes * parts)
+    holds = ti.cast(counters.found[2] == 0, ti.i32)
+    count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[3]
+    enclosing = searching = ti.min(count, 1) * workers
+    looking = ti.min(due_count, 1) * workers
+    if ti.static(runs_on_gpu()):
+        enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), 2 * count * threads
+        looking = 2 * due_count * lanes
     if count > 0:
         lists.ends[2], lists.ends[3] = 0, 0
-    begin_sharing(taken, 0)
+    begin_sharing(counters.taken, 0)
     for worker in range(enclosing):
-        item = next_item(-1, worker, taken, 0, ENCLOSED_AT_A_TIME)
-        while item < blocks.vertices.count + count:
-            if item >= blocks.vertices.count:
-                p = met.expired[item - blocks.vertices.count]
+        item = next_item(-1, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
+        while item < blocks.vertices.count * lanes + count:
+            if item >= blocks.vertices.count * lanes:
+                p = met.expired[item - blocks.vertices.count * lanes]
                 lists.triangles.pieces[p][2], lists.edges.pieces[p][2] = 0, 0
-            elif met.needed[item] == 1:
-                met.needed[item] = 0
-                enclose_elements(item, surface.position, blocks.edges, blocks.triangles)
-            item = next_item(item, worker, taken, 0, ENCLOSED_AT_A_TIME)
-    begin_sharing(taken, 1)
+            elif met.needed[item // lanes] == 1:
+                enclose_elements(item // lanes, item % lanes, lanes, surface.position, blocks.edges, blocks.triangles)
+            item = next_item(item, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
+    begin_sharing(counters.taken, 1)
     for worker in range(searching):
-        item = next_item(-1, worker, taken, 1, SEARCHED_AT_A_TIME)
-        while item < 2 * count * lanes:
-            if item < count * lanes:
-                p = met.expired[item // lanes]
-                pair_vertices_with_triangles(p, item % lanes, lanes, met, boxes, surface, blocks, lists.triangles)
+        item = next_item(-1, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
+        while item < 2 * count * threads:
+            if item < count * threads:
+                p = met.expired[item // threads]
+                pair_vertices_with_triangles(
+                    p, item % threads, lanes, parts, met, boxes, surface, blocks, lists.triangles
+                )
             else:
-                p = met.expired[item // lanes - count]
-                pair_edges(p, item % lanes, lanes, met, boxes, blocks.edges, lists.edges)
-            item = next_item(item, worker, taken, 1, SEARCHED_AT_A_TIME)
+                p = met.expired[item // threads - count]
+                pair_edges(p, item % threads, lanes, parts, met, boxes, blocks.edges, lists.edges)
+            item = next_item(item, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for k in range(count):
+        pair = met.pairs[met.expired[k]]
+        met.needed[pair[0]], met.needed[pair[1]] = 0, 0
         lengthen(met.expired[k], lists.triangles, lists.ends, 0)
         lengthen(met.expired[k], lists.edges, lists.ends, 1)
-    fits = ti.cast(lists.ends[0] <= numbers[2] and lists.ends[1] <= numbers[3], ti.i32)
+    fits = ti.cast(lists.ends[0] <= numbers[1] and lists.ends[1] <= numbers[2], ti.i32)
     short, short_edges = fits * lists.ends[2], fits * lists.ends[3]
-    searching_again, looking_now = ti.min(short + short_edges, 1) * searching, fits * looking
+    searching_again, looking_now = ti.min(short + short_edges, 1) * workers, fits * looking
     if ti.static(runs_on_gpu()):
-        searching_again = (short + short_edges) * lanes
-    begin_sharing(taken, 2)
+        searching_again = (short + short_edges) * threads
+    begin_sharing(counters.taken, 2)
     for worker in range(searching_again):
-        item = next_item(-1, worker, taken, 2, SEARCHED_AT_A_TIME)
-        while item < (short + short_edges) * lanes:
-            if item < short * lanes:
-                p = lists.triangles.again[item // lanes]
-                pair_vertices_with_triangles(p, item % lanes, lanes, met, boxes, surface, blocks, lists.triangles)
+        item = next_item(-1, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
+        while item < (short + short_edges) * threads:
+            if item < short * threads:
+                p = lists.triangles.again[item // threads]
+                pair_vertices_with_triangles(
+                    p, item % threads, lanes, parts, met, boxes, surface, blocks, lists.triangles
+                )
             else:
-                p = lists.edges.again[item // lanes - short]
-                pair_edges(p, item % lanes, lanes, met, boxes, blocks.edges, lists.edges)
-            item = next_item(item, worker, taken, 2, SEARCHED_AT_A_TIME)
-    begin_sharing(taken, 3)
+                p = lists.edges.again[item // threads - short]
+                pair_edges(p, item % threads, lanes, parts, met, boxes, blocks.edges, lists.edges)
+            item = next_item(item, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
+    begin_sharing(counters.taken, 3)
     for worker in range(looking_now):
-        item = next_item(-1, worker, taken, 3, DUE_AT_A_TIME)
+        item = next_item(-1, worker, counters.taken, 3, DUE_AT_A_TIME)
         while item < 2 * due_count * lanes:
             if item < due_count * lanes:
                 look_at_piece(
@@ -143,6 +158,6 @@ def find_near_pairs(
                     recovery,
                     contacts,
                 )
-            item = next_item(item, worker, taken, 3, DUE_AT_A_TIME)
+            item = next_item(item, worker, counters.taken, 3, DUE_AT_A_TIME)
     lists.ends[2], lists.ends[3] = lists.ends[2] - short, lists.ends[3] - short_edges
-    contacts.counter[1], contacts.counter[2] = lists.ends[0], lists.ends[1]
+    contacts.counter[1], contacts.counter[2], contacts.counter[4] = lists.ends[0], lists.ends[1], holds * fits

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -158,6 +159,7 @@ class PatchPairs:
         capacity: room for so many.
         bounds: boxes around patches at the last `look`, and the rigid motion of each in the substep.
         carried: numbers that pairs had before the last `meet`, or -1, (count,).
+        counters: of `look_at_patches` and `end_contacts`.
         expired_count, due_count: how many pairs have to be searched, and have elements that have to be looked at.
 
     Args:
@@ -173,7 +175,7 @@ class PatchPairs:
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree: BoxTree = with_room(BoxTree, 2 * patches.leaves, leaves=patches.leaves)
         self._moving = MovingPatches(patches.corner_lists, self.bounds, self._budget)
-        self._counters: Counters = with_room(Counters, 3)
+        self.counters: Counters = with_room(Counters, 3)
         self._first_known = ti.ndarray(ti.i32, 2 * max(m, 1))
         self._maxima = LaneReduction(maxima=7, sums=0)
         self._astray, self._half_thickness, self._still, self._fits = 0.0, 0.0, 0.0, True
@@ -207,10 +209,10 @@ class PatchPairs:
         self._budget.margin.fill(MARGIN * thickness)
         self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
-    def look(self, state: ClothState, ageing: Ageing | None = None) -> tuple[float, bool]:
+    def look(self, state: ClothState, ageing: Ageing | None = None) -> Callable[[], tuple[float, bool]]:
         """Note where patches are and how they move in this substep.
 
-        Returns how far vertices get apart from their common motion [m]; and whether the pairs of patches hold for this
+        Asks how far vertices get apart from their common motion [m]; and whether the pairs of patches hold for this
         substep, if they held before. If they are to be aged then, they have been.
 
         Args:
@@ -251,21 +253,21 @@ class PatchPairs:
             merge_boxes(first, tree)
         before = self.on_device.pairs, self.on_device.slack
         known = KnownPairs(self._first_known, self._known, *before)
-        sort_known(known_count, patches.count, known, self._counters.found)
+        sort_known(known_count, patches.count, known, self.counters.found)
         pairs, slack = self._spare
         self.on_device, self._spare = self.on_device._replace(pairs=pairs, slack=slack), before
         while True:
             found = pair_patches(
                 patches.count,
                 workers_for(patches.count),
-                self._counters.taken,
+                self.counters.taken,
                 tree,
                 patches.cloth,
                 collides,
                 known,
                 self.on_device,
                 self.carried,
-                self._counters.found,
+                self.counters.found,
                 self.capacity,
             )
             if found < 0 or found > MAX_PAIRS:
@@ -283,14 +285,14 @@ class PatchPairs:
             state: at the start of the substep.
             ageing: how; `PairPieces.piece_due` of both lists is `NEVER` after this where a pair is due.
         """
-        self._look(state, 0, ageing)
+        self._look(state, 0, ageing)()
         return self.expired_count
 
-    def _look(self, state: ClothState, vertex_count: int, ageing: Ageing | None) -> tuple[float, bool]:
+    def _look(self, state: ClothState, vertex_count: int, ageing: Ageing | None) -> Callable[[], tuple[float, bool]]:
         """Look at the patches unless there are no vertices, then age the pairs unless nothing is said about that."""
         patches, looks_at_patches = self.patches, vertex_count > 0
         vertex_count = vertex_count if self._fits else 0
-        motion, astray, expired, due = look_at_patches(
+        asked = look_at_patches.later(
             vertex_count,
             self._tracked(state),
             self._maxima.over(vertex_count),
@@ -300,13 +302,18 @@ class PatchPairs:
             self.on_device,
             ageing or Ageing(0.0, 0.0, self.on_device.left, self.on_device.left),
             (workers_for(patches.count) if looks_at_patches else 0, workers_for(self.count) if ageing else 0),
-            self._counters,
+            self.counters,
             self._is_short,
         )
-        if vertex_count:
-            self._astray = float(np.int32(astray).view(np.float32))
-        self.expired_count, self.due_count = max(int(expired), 0), int(due)
-        return float(np.int32(motion).view(np.float32)), expired >= 0
+
+        def answer() -> tuple[float, bool]:
+            motion, astray, expired, due = asked()
+            if vertex_count:
+                self._astray = float(np.int32(astray).view(np.float32))
+            self.expired_count, self.due_count = max(int(expired), 0), int(due)
+            return float(np.int32(motion).view(np.float32)), expired >= 0
+
+        return answer
 
     def finish(
         self,
@@ -317,11 +324,11 @@ class PatchPairs:
         negligible: float,
         *,
         is_changed: bool,
-    ) -> list[int]:
+    ) -> Callable[[], list[int]]:
         """Test contacts, and if all is well the substep is over: its motion is used up, and what contacts added to it.
 
         Where they displaced patches farther than allowed for, they may displace these half as far again from now on.
-        Returns what `end_contacts` does.
+        Asks for what `end_contacts` returns.
 
         Args:
             state: at the end of its displacements.
@@ -332,7 +339,7 @@ class PatchPairs:
             is_changed: whether contacts changed displacements.
         """
         patches, half = self.patches, self._half_thickness
-        found: list[int] = end_contacts(
+        return end_contacts.later(
             count if self._fits else 0,
             contacts.found,
             TestedContacts(contacts.impulses().impulse, state.inverse_mass, state.thickness, contacts.crossing),
@@ -343,7 +350,6 @@ class PatchPairs:
             SubstepEnd(int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
             self.on_device,
             (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
-            self._counters,
+            self.counters,
             self._is_short,
         )
-        return found

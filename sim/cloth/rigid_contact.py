@@ -1,7 +1,7 @@
 """Cloth against rigid bodies and walls: what touches in a substep."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -217,9 +217,9 @@ class RigidContact:
         motion: PatchMotion,
         contacts: ContactList,
         recovery: float,
-    ) -> list[int]:
-        """Append what touches in this substep. Returns the numbers of the list's counter, the first of which is how
-        many contacts were found in all; that is 0 from then on. Waits for the device.
+    ) -> Callable[[], list[int]]:
+        """Append what touches in this substep. Asks for the numbers of the list's counter, the first of which is how
+        many contacts were found in all; that is 0 from then on.
 
         Args:
             state: at the start of a substep.
@@ -229,7 +229,7 @@ class RigidContact:
             recovery: share of a missing distance that the substep gives back [-].
         """
         lanes, is_alone = lanes_of_pair(), not (self._walls.count or self.bodies.count)
-        found: list[int] = find_rigid_contacts(
+        return find_rigid_contacts.later(
             PatchLists(patches.vertex_lists, patches.elements),
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
             self._taken,
@@ -243,7 +243,6 @@ class RigidContact:
             contacts.found,
             SHOWN_BODIES if self._shows.any() else BODIES if self.bodies.count else NO_BODIES,
         )
-        return found
 
 
 @kernel
@@ -472,6 +471,7 @@ def find_rigid_contacts(
                     place += lanes
                 item = next_item(item, worker, taken, 1, PATCHES_AT_A_TIME)
     found = ti.math.ivec3(contacts.counter[0], contacts.counter[1], contacts.counter[2])
+    contacts.counter[3] = ti.select(contacts.counter[4] == 1 and found[0] <= contacts.capacity, found[0], 0)
     contacts.counter[0] = 0
     return found
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Ageing, Boxes, PairLists, PatchBlocks, PatchMotion, Rest
+from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, PatchMotion, Rest
 from sim.cloth.element_blocks import ElementBlocks
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.near_pairs import find_near_pairs
 from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
-from sim.cloth.self_collision_kernels import lanes_of_pair, range_of_vectors
+from sim.cloth.self_collision_kernels import range_of_vectors
 from sim.core.arrays import on_device
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
@@ -53,6 +53,7 @@ class SelfCollision:
         coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart. `longest_edge` of all.
         meets: whether any elements may meet: of several cloths, or of one that collides with itself.
         searches: how many pairs of patches were searched since `begin_frame`, over the number of patches.
+        outcome: what the last `finish` answers, on the device.
 
     Args:
         state: the cloths; a triangle without a common corner must not cross another at the start.
@@ -75,9 +76,11 @@ class SelfCollision:
         self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
         cloth_of = state.host.body[state.host.edges[:, 0]]
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
+        self._nothing = on_device(np.zeros(3, dtype=np.int32))
+        self.outcome = self._nothing
         self.thickness = 0.0
         self._listed_for: tuple[bytes, tuple[bool, ...]] = (b"", ())
-        self._is_forgotten, self._is_outrun, self._lacks_room = True, False, False
+        self._is_forgotten, self._is_outrun = True, False
         self.begin_frame(state)
 
     def forget(self) -> None:
@@ -105,15 +108,23 @@ class SelfCollision:
         """How often the elements of a patch were searched since `begin_frame`, on average."""
         return self._searched / max(self._patches.count, 1)
 
-    def look(self, state: ClothState) -> float:
-        """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m].
-
-        0 where none may meet: that is asked of pairs alone.
-        """
+    def look(self, state: ClothState) -> None:
+        """Note how cloth moves in this substep."""
         is_aged = self.meets and not (self._is_forgotten or self._is_outrun)
-        motion, holds = self._met.look(state, self._ageing if is_aged else None)
-        self._is_outrun |= not holds
-        return motion if self.meets else 0.0
+        self._asked = self._met.look(state, self._ageing if is_aged else None)
+        self._looked: tuple[float, bool] | None = None
+        self._is_searched = False
+
+    def looked(self) -> tuple[float, bool]:
+        """How far vertices get apart from their common motion [m]; and whether pairs of patches hold, so that `find`
+        could find all. Else it does when it is called again. Where none may meet none is said to move.
+        """
+        if self._looked is None:
+            motion, holds = self._asked()
+            self._is_outrun |= not holds
+            self._searched += self._met.expired_count
+            self._looked = (motion, holds) if self.meets else (0.0, True)
+        return self._looked
 
     @property
     def _ageing(self) -> Ageing:
@@ -130,14 +141,16 @@ class SelfCollision:
 
     def finish(
         self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
-    ) -> list[int]:
+    ) -> Callable[[], list[int]]:
         """See `PatchPairs.finish`."""
         if not (self.meets or is_changed or self._was_changed):
-            return [0, 0, 0]
+            self.outcome = self._nothing
+            return lambda: [0, 0, 0]
+        self.outcome = self._met.counters.found
         self._was_changed, negligible = is_changed, NEGLIGIBLE * self.thickness
         return self._met.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
 
-    def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
+    def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.
 
         All pairs are listed first that vertices can bring within their thickness, or together, in this substep. Pairs
@@ -148,8 +161,11 @@ class SelfCollision:
             state: in a substep.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
+            is_ahead: not to wait for what `look` has found; if pairs of patches do not hold, nothing is appended.
         """
         met, lists = self._met, (self.with_triangles, self.of_edges)
+        if not is_ahead or self._is_forgotten or self._is_outrun:
+            self.looked()
         if not self.meets:
             return
         if self._is_forgotten or self._is_outrun:
@@ -160,19 +176,13 @@ class SelfCollision:
                 else:
                     pairs.set_pieces(met.capacity)
             self._is_forgotten = self._is_outrun = False
-            met.age(state, self._ageing)
-        count, lanes, patches = met.expired_count, lanes_of_pair(), self._patches
-        met.expired_count, self._searched = 0, self._searched + count
-        if not (count or met.due_count or self._lacks_room):
+            self._searched += met.age(state, self._ageing)
+            self._looked, self._is_searched = (self.looked()[0], True), False
+        if not (is_ahead or met.expired_count or met.due_count):
             return
         find_near_pairs(
-            (count, met.due_count, *(pairs.capacity for pairs in lists)),
-            (
-                workers_for(patches.count + count) if count else 0,
-                workers_for(2 * count * lanes) if count or self._lacks_room else 0,
-                workers_for(2 * met.due_count * lanes),
-            ),
-            self._taken,
+            (int(not self._is_searched), *(pairs.capacity for pairs in lists), workers_for(1)),
+            Counters(self._taken, met.counters.found),
             met.on_device,
             Boxes(met.bounds.low, met.bounds.high),
             self._blocks,
@@ -182,6 +192,7 @@ class SelfCollision:
             recovery,
             contacts.found,
         )
+        self._is_searched = True
 
     def make_room_for(self, ends: Sequence[int]) -> bool:
         """Whether the lists were too short for what was searched, so that `find` has to go on; now there is room.
@@ -190,8 +201,7 @@ class SelfCollision:
             ends: that they need, as `find` left them in the list of contacts.
         """
         lists = (self.with_triangles, self.of_edges)
-        self._lacks_room = True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
-        return self._lacks_room
+        return True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
 
     @property
     def motion(self) -> PatchMotion:
@@ -209,8 +219,8 @@ class SelfCollision:
         return self._met
 
 
-def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Box:
-    """Middle and half edges of the box around vectors, (3,) each, the same whatever their order.
+def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Callable[[], Box]:
+    """Asks for middle and half edges of the box around vectors, (3,) each, the same whatever their order.
 
     Args:
         vectors: of which those from `first` up to `end` are looked at, at least one.
@@ -218,6 +228,10 @@ def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) ->
         ends_of: of six maxima.
     """
     count = end - first
-    numbers = range_of_vectors(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
-    ends = ends_of.unpack(numbers).astype(np.float64)
-    return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])
+    asked = range_of_vectors.later(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
+
+    def answer() -> Box:
+        ends = ends_of.unpack(asked()).astype(np.float64)
+        return 0.5 * (ends[:3] - ends[3:]), 0.5 * (ends[:3] + ends[3:])
+
+    return answer

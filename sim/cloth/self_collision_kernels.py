@@ -22,6 +22,7 @@ from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import Results, Share, reduced, runs_on_gpu
 from sim.core.scheduling import begin_sharing, next_item
+from sim.core.warps import raise_to
 
 OF_REST_DISTANCE = 0.7
 """Elements that are nearer than their thickness when the cloth is flat keep this part of their distance there."""
@@ -34,13 +35,19 @@ triangles, vertices alone then push."""
 END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
-LANES = 32
-"""Threads of a GPU that search a pair of patches: one for each edge or so, as few pairs are searched at rest."""
+LANES, PARTS = 32, 4
+"""Threads of a GPU for a pair of patches, one for each edge or so; and how many times as many for a search, one for
+each block: few pairs are searched at rest, and a thread takes long."""
 
 
 def lanes_of_pair() -> int:
     """Threads that share the work of a pair of patches."""
     return LANES if runs_on_gpu() else 1
+
+
+def parts_of_search() -> int:
+    """How many times as many share a search, by the blocks of elements that an element is compared with."""
+    return PARTS if runs_on_gpu() else 1
 
 
 BLOCK = 16
@@ -92,8 +99,9 @@ def lowest_bit(bits: ti.i32) -> ti.i32:
 @func
 def pair_vertices_with_triangles(
     p: ti.i32,
-    lane: ti.i32,
+    thread: ti.i32,
     lanes: ti.i32,
+    parts: ti.i32,
     met: PatchPairArrays,
     boxes: Boxes,
     surface: Surface,
@@ -101,7 +109,7 @@ def pair_vertices_with_triangles(
     found: PairPieces,
 ):
     """List the vertices of each of two patches that are near triangles of the other, as one of several threads."""
-    soonest = NEVER
+    soonest, lane, part = NEVER, thread % lanes, thread // lanes
     for side in range(2):
         m, other = met.pairs[p][side], met.pairs[p][1 - side]
         place = blocks.vertices.first[m] + lane
@@ -114,8 +122,9 @@ def pair_vertices_with_triangles(
             x = surface.position[v]
             if (x >= least).all() and (x <= most).all():
                 within = met.reach[p] * met.reach[p]
-                for block in range(blocks.triangles.first_block[other], blocks.triangles.first_block[other + 1]):
-                    near = 0
+                first, end = blocks.triangles.first_block[other] + part, blocks.triangles.first_block[other + 1]
+                for k_block in range((end - first + parts - 1) // parts):
+                    near, block = 0, first + k_block * parts
                     for k in range(BLOCK):
                         t = block * BLOCK + k
                         dx = ti.max(blocks.triangles.low_x[t] - x[0], x[0] - blocks.triangles.high_x[t], 0.0)
@@ -138,14 +147,15 @@ def pair_vertices_with_triangles(
                                     found.pairs[there] = Four(v, corners[0], corners[1], corners[2])
                                     found.wanted[there], found.due[there] = UNKNOWN, met.slack[p] - apart
                                     soonest = ti.max(soonest, met.slack[p] - apart)
-    ti.atomic_max(found.piece_due[p], soonest)
+    raise_to(found.piece_due, p, soonest, lane)
 
 
 @func
 def pair_edges(
     p: ti.i32,
-    lane: ti.i32,
+    thread: ti.i32,
     lanes: ti.i32,
+    parts: ti.i32,
     met: PatchPairArrays,
     boxes: Boxes,
     blocks: EdgeBlocks,
@@ -156,7 +166,7 @@ def pair_edges(
     Edges are first told apart by their shadows on the line through their midpoints, and on what of that is across the
     first of them: disjoint for most neighbours in flat cloth, where spheres around them are not.
     """
-    soonest = NEVER
+    soonest, lane, part = NEVER, thread % lanes, thread // lanes
     m, other = met.pairs[p][0], met.pairs[p][1]
     within = met.reach[p] * met.reach[p]
     least, most = boxes.low[other] - met.reach[p], boxes.high[other] + met.reach[p]
@@ -169,10 +179,9 @@ def pair_edges(
         middle, half = ti.math.vec3(x, y, z), ti.math.vec3(g, h, i)
         steep = ti.max(half.norm_sqr(), 1.0e-30)
         if (middle + ti.abs(half) >= least).all() and (middle - ti.abs(half) <= most).all():
-            for block in range(
-                ti.select(m == other, own // BLOCK, blocks.first_block[other]), blocks.first_block[other + 1]
-            ):
-                near = 0
+            first = ti.select(m == other, own // BLOCK, blocks.first_block[other]) + part
+            for k_block in range((blocks.first_block[other + 1] - first + parts - 1) // parts):
+                near, block = 0, first + k_block * parts
                 for k in range(BLOCK):
                     f = block * BLOCK + k
                     dx, dy, dz = blocks.mid_x[f] - x, blocks.mid_y[f] - y, blocks.mid_z[f] - z
@@ -207,7 +216,7 @@ def pair_edges(
                                 )
                                 found.wanted[place_of_pair], found.due[place_of_pair] = UNKNOWN, met.slack[p] - apart
                                 soonest = ti.max(soonest, met.slack[p] - apart)
-    ti.atomic_max(found.piece_due[p], soonest)
+    raise_to(found.piece_due, p, soonest, lane)
 
 
 @func
@@ -286,7 +295,7 @@ def look_at_piece(
             )
         soonest = ti.max(soonest, listed.due[place])
         place += lanes
-    ti.atomic_max(listed.piece_due[both], soonest)
+    raise_to(listed.piece_due, both, soonest, lane)
 
 
 @func

@@ -77,14 +77,24 @@ class ClothContacts(Protocol):
     def stable_dt(self, state: ClothState, at_most: float) -> float:
         """Largest step [s] for the current state, `at_most` this one."""
 
-    def resolve(self, state: ClothState, dt: float, relax: Callable[[], bool]) -> None:
+    def resolve(
+        self,
+        state: ClothState,
+        dt: float,
+        relax: Callable[[], Callable[[], bool]],
+        conclude: Callable[[ti.Ndarray], None] | None = None,
+    ) -> bool:
         """Change the displacements of a step of dt [s], after the springs have; pinned nodes stay as they are.
+
+        Returns whether the step was concluded.
 
         Args:
             state: with displacements.
             dt: [s].
-            relax: lets the springs change displacements once more where contacts stretched them too much, and says
-                whether it did; contacts are resolved again then.
+            relax: asks how long springs are. The answer lets them change displacements once more where contacts
+                stretched them too much, and says whether it did; contacts are resolved again then.
+            conclude: has the device finish the step if three numbers there are 0, as they are where nothing remains to
+                be done: a GPU would wait while the host reads them. If contacts of another kind follow, there is none.
         """
 
     def begin_frame(self) -> None:
@@ -167,6 +177,8 @@ class ClothSolver:
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
         self._time_s = 0.0
+        self._no_reasons = ti.ndarray(ti.i32, 3)
+        self._no_reasons.fill(0)
         self._sweeps = self._refinement = 1
         self._excess = 0.0
         self._hold_pins()
@@ -277,37 +289,54 @@ class ClothSolver:
         self.air.predict(self.gravity, dt)
         self._pins.displace(self._time_s, dt)
         self._displace(dt)
-        state = self.state
-        finish_step(state.nodes, state.motion, state.position, state.limit, dt, self._is_short)
         if self.load is not None:
-            self.load.take_off(state)
+            self.load.take_off(self.state)
         self._time_s += dt
 
     def _displace(self, dt: float) -> None:
-        """Springs and contacts in turns; as these leave springs too long, the next step has more sweeps, or is shorter.
+        """Springs and contacts in turns, and where they lead; as these leave springs too long, the next step has more
+        sweeps, or is shorter.
 
         One sweep, and no measure of springs by themselves, of a cloth that is given `substeps`: these are what it pays
         for. Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
         shortened for those that omit `substeps`.
         """
-        integrator, turns = self._integrator, 0
+        state, integrator, turns = self.state, self._integrator, 0
+        at_end: Callable[[], NDArray[np.float64]] | None = None
         integrator.displace(dt, np.where(self._adapts, self._sweeps, self._iterations))
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        excess = integrator.excess(dt) if self._adapts.any() and is_loose else None
+        excess = integrator.excess(dt)() if self._adapts.any() and is_loose else None
         by_springs = 0.0 if excess is None else float(excess[self._adapts].max())
 
-        def relax() -> bool:
-            nonlocal turns, excess
-            excess = integrator.excess(dt)
-            if turns == MOST_TURNS or excess[self._takes_turns].max(initial=0.0) < RELAXED_BEYOND:
-                return False
-            turns += 1
-            integrator.sweep(dt, self._takes_turns)
-            return True
+        def relax() -> Callable[[], bool]:
+            measured = integrator.excess(dt)
 
+            def go_on() -> bool:
+                nonlocal turns, excess
+                excess = measured()
+                if turns == MOST_TURNS or excess[self._takes_turns].max(initial=0.0) < RELAXED_BEYOND:
+                    return False
+                turns += 1
+                integrator.sweep(dt, self._takes_turns)
+                return True
+
+            return go_on
+
+        def conclude(reasons: ti.Ndarray) -> None:
+            nonlocal at_end
+            if excess is None:
+                at_end = integrator.excess(dt)
+            finish_step(state.nodes, state.motion, state.position, state.limit, dt, reasons, self._is_short)
+
+        is_concluded = False
         for contacts in self.contacts:
-            contacts.resolve(self.state, dt, relax)
-        excess = integrator.excess(dt) if excess is None else excess
+            is_last = contacts is self.contacts[-1]
+            is_concluded = contacts.resolve(state, dt, relax, conclude if is_last else None)
+        if not is_concluded:
+            conclude(self._no_reasons)
+        if excess is None:
+            assert at_end is not None
+            excess = at_end()
         self._excess = float(excess[self._refines].max(initial=0.0))
         if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2

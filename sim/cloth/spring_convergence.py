@@ -9,10 +9,9 @@ import taichi as ti
 
 from sim.cloth.bundles import Lines, Nodes, SpringArrays
 from sim.cloth.row_blocks import LANES, Blocks
-from sim.core.arrays import Floats
+from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import Share, device_lanes, runs_on_gpu
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -40,27 +39,22 @@ def excess_of(
 
 @kernel
 def measure_excess(
-    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, share: Share
+    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
 ) -> ti.math.vec2:
-    """Largest excess of springs of threads in lists, and how many have not converged."""
-    highest, total = 0, 0
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for lane in range(ti.static(device_lanes().count)):
-        largest, unconverged = 0.0, 0
-        for k in range(share.items):
-            s = lane * share.lane_step + k * share.item_step
-            if s < count:
-                i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-                excess = excess_of(
-                    i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
-                )
-                largest = ti.max(largest, excess)
-                if excess > LARGEST_RESIDUAL:
-                    unconverged += 1
-        ti.atomic_max(highest, ti.bit_cast(largest, ti.i32))  # bits of numbers from 0 on are in their order
-        ti.atomic_add(total, unconverged)
-    return ti.math.vec2(ti.bit_cast(highest, ti.f32), ti.cast(total, ti.f32))
+    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
+    end = count
+    found[0], found[1] = 0, 0
+    for s in range(end):
+        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+        excess = excess_of(
+            i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
+        )
+        bits = ti.bit_cast(excess, ti.i32)  # those of numbers from 0 on are in their order
+        if excess > 0.0 and bits > found[0]:  # all others would wait in line to change nothing
+            ti.atomic_max(found[0], bits)
+        if excess > LARGEST_RESIDUAL:
+            ti.atomic_add(found[1], 1)
+    return ti.math.vec2(ti.bit_cast(found[0], ti.f32), ti.cast(found[1], ti.f32))
 
 
 @kernel

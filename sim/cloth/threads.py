@@ -1,5 +1,7 @@
 """Threads of rectangles on a GPU, solved piece by piece instead of spring by spring."""
 
+from collections.abc import Callable
+
 import numpy as np
 import taichi as ti
 
@@ -9,7 +11,6 @@ from sim.cloth.spring_convergence import measure_excess
 from sim.cloth.state import ClothState
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.reductions import LaneReduction
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
@@ -54,7 +55,7 @@ class ThreadSolver:
         starts = springs.segment_start.to_numpy()
         self._work = ThreadWork(*(ti.ndarray(ti.f32, springs.count) for _ in range(2)))
         self._pieces = Pieces(springs.segment_start, springs.piece_of_colour, ti.ndarray(ti.i32, len(starts) - 1))
-        self._excess = LaneReduction(maxima=1, sums=1)
+        self._found = ti.ndarray(ti.i32, 2)
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
             self._rows *= 2
@@ -97,12 +98,14 @@ class ThreadSolver:
                 springs.first_colours.step,
             )
 
-    def excess(self, state: ClothState, dt: float) -> tuple[float, int]:
-        """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
+    def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
+        """Asks for the largest excess of a spring [rest lengths], and how many have not converged
+        (`spring_convergence`).
+        """
         springs = self.springs
-        share = self._excess.over(springs.count)
-        found = measure_excess(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, share)
-        return float(found[0]), int(found[1])
+        return measure_excess.later(
+            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found
+        )
 
 
 @ti.func
@@ -176,10 +179,10 @@ def solve_threads(
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
     """
-    bounds = colour_bounds(pieces.piece_of_colour, first, colours)
-    for colour in ti.static(range(colours)):
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(pieces.piece_of_colour, first, colours, rows)
+    for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         ti.loop_config(block_dim=rows)
-        for row in range(bounds[colour] * rows, bounds[colour + 1] * rows):
+        for row in range(begin, end):
             p, k = row // rows, row % rows
             s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
             one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
@@ -246,10 +249,10 @@ def straighten_threads(
     e~ is by how much springs have changed the displacements, e by how much they shall have; t_i is the tension of the
     spring from node i on.
     """
-    bounds = colour_bounds(pieces.piece_of_colour, first, colours)
-    for colour in ti.static(range(colours)):
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(pieces.piece_of_colour, first, colours, rows)
+    for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         ti.loop_config(block_dim=rows)
-        for row in range(bounds[colour] * rows, bounds[colour + 1] * rows):
+        for row in range(begin, end):
             p, k = row // rows, row % rows
             s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
             one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)

@@ -2,7 +2,7 @@
 rectangles and triangles of meshes as many at once.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import taichi as ti
@@ -69,19 +69,25 @@ class XPBDSprings:
         for triangles in self._triangles:
             triangles.take_parameters()
 
-    def excess(self, dt: float) -> NDArray[np.float64]:
-        """By how much threads, or meshes at a node, are longer than tension makes them, at most [rest lengths].
+    def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:
+        """Asks by how much threads, or meshes at a node, are longer than tension makes them, at most [rest lengths].
 
-        Of each cloth; those that are solved in the same lists have the same.
+        Of each cloth; those that are solved in the same lists have the same. To be answered before springs or contacts
+        go on.
         """
-        found = [(threads.springs.cloths, *threads.excess(self._state, dt)) for threads in self._threads]
-        found += [({number}, *rectangle.excess(dt)) for number, rectangle in self._rectangles.items()]
-        found += [(triangles.cloths, *triangles.excess()) for triangles in self._triangles]
-        self._unconverged = sum(count for *_, count in found)
-        largest = np.zeros(len(self._state.names))
-        for cloths, excess, _ in found:
-            largest[list(cloths)] = np.maximum(largest[list(cloths)], excess)
-        return largest
+        asked = [(threads.springs.cloths, threads.excess(self._state, dt)) for threads in self._threads]
+
+        def answer() -> NDArray[np.float64]:
+            found = [(cloths, *excess()) for cloths, excess in asked]
+            found += [({number}, *rectangle.excess(dt)) for number, rectangle in self._rectangles.items()]
+            found += [(triangles.cloths, *triangles.excess()) for triangles in self._triangles]
+            self._unconverged = sum(count for *_, count in found)
+            largest = np.zeros(len(self._state.names))
+            for cloths, excess, _ in found:
+                largest[list(cloths)] = np.maximum(largest[list(cloths)], excess)
+            return largest
+
+        return answer
 
     def diagnostics(self) -> Mapping[str, float]:
         """`overlong_springs`: at the end of the frame, along the threads of rectangles, and at the nodes of meshes."""
@@ -231,9 +237,9 @@ def solve_bends(
 ):
     """The bend springs of so many colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    bounds = colour_bounds(spring_of_colour, colour, colours)
-    for k in ti.static(range(colours)):
-        for s in range(bounds[k], bounds[k + 1]):
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(spring_of_colour, colour, colours, 1)
+    for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
+        for s in range(begin, end):
             solve_bend(s, springs, nodes, dt_squared, rate, arity)
 
 
@@ -274,8 +280,8 @@ def damp_springs(
 ):
     """The springs of so many colours, one colour after the other, and one by one within a piece."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    bounds = colour_bounds(piece_of_colour, colour, colours)
-    for k in ti.static(range(colours)):
-        for piece in range(bounds[k], bounds[k + 1]):
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(piece_of_colour, colour, colours, 1)
+    for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
+        for piece in range(begin, end):
             for s in range(segment_start[piece], segment_start[piece + 1]):
                 damp_spring(s, springs, nodes, motion, dt, arity)

@@ -14,6 +14,7 @@ import ctypes
 import functools
 import os
 import re
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -119,7 +120,7 @@ class Graph:
         self._is_new = True
 
     def __del__(self) -> None:
-        if hasattr(self, "_graph"):
+        if hasattr(self, "_graph") and not sys.is_finalizing():  # with the process all is gone
             _make_current(self._context)
             ask("cuGraphExecDestroy", self._graph)
             ask("cuMemFree_v2", self._memory)

@@ -39,6 +39,9 @@ MOST_LAUNCHES = 256  # most combinations of arrays whose launch context a kernel
 
 LAUNCHES_BEFORE_GRAPH = 2  # with the same arrays: a graph takes as long to make as some launches
 
+_waits = [0]
+"""How often somebody has waited for all that was launched."""
+
 ADDRESS_OF_ARRAY = 1  # place of an array's address among what a kernel gets of it, after its shape
 
 
@@ -113,6 +116,13 @@ class FastKernel:
 
     def __call__(self, *args: Any) -> Any:
         """Launch; waits for the device only where the kernel returns something."""
+        return self.later(*args)()
+
+    def later(self, *args: Any) -> Callable[[], Any]:
+        """Launch; what is returned is called for the result, which waits for the device unless somebody has since.
+
+        To be called before the kernel is launched again.
+        """
         program = impl.get_runtime().prog
         if program is not self._program:
             self._program, self._compiled, self._launches = program, {}, {}
@@ -125,9 +135,11 @@ class FastKernel:
         if launch is None:
             compiled = self._compiled.get(self._key(used))
             if compiled is None:
-                return self._first_call(program, args)
+                result = self._first_call(program, args)
+                return lambda: result
             launch = self._launches[key] = self._kept(program, key, compiled, arrays, len(used))
-        return self._launch(program, launch, used)
+        context = self._launch(program, launch, used)
+        return functools.partial(self._result, program, launch, context, _waits[0])
 
     def _kept(
         self,
@@ -206,7 +218,7 @@ class FastKernel:
         return result.to_numpy().tolist() if self._returns_vector else result
 
     def _launch(self, program: Any, launch: _Launch, used: Sequence[Any]) -> Any:
-        """Launch with arrays that are kept and the numbers among what is `used`."""
+        """Launch with arrays that are kept and the numbers among what is `used`; returns the context."""
         context, passed = launch.context, launch.numbers
         if context is None:
             context, passed = launch.make_context(), [None] * len(used)  # it does not outlive the launch
@@ -222,10 +234,16 @@ class FastKernel:
             program.launch_kernel(launch.compiled, context)
         else:
             launch.graph.launch(is_changed=is_changed)
+        return context
+
+    def _result(self, program: Any, launch: _Launch, context: Any, waits: int) -> Any:
+        """What a launch returned, before which there were so many waits."""
         if self._primal.return_type is None:
             return None
         if not self._on_cpu:
-            program.synchronize()
+            if waits == _waits[0]:
+                program.synchronize()
+                _waits[0] += 1
             if launch.graph is not None:
                 launch.graph.take_result()
         kind = self._primal.return_type[0]

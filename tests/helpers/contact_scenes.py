@@ -62,7 +62,7 @@ def find(state: ClothState, pairs: SelfCollision) -> ContactList:
     while True:
         contacts.found.counter.fill(0)
         pairs.find(state, contacts, 0.1)
-        if not pairs.make_room_for(contacts.found.counter.to_numpy()[1:].tolist()):
+        if not pairs.make_room_for(contacts.found.counter.to_numpy()[1:3].tolist()):
             return contacts
 
 
@@ -77,9 +77,9 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
     state = solver.state
     state.displacement.from_numpy(displacement.astype(np.float32))
     for contacts in solver.contacts:
-        contacts.resolve(state, dt, lambda: False)
+        contacts.resolve(state, dt, lambda: lambda: False)
     allowed = state.displacement.to_numpy().astype(np.float64)
-    finish_step(state.nodes, state.motion, state.position, state.limit, dt, False)
+    finish_step(state.nodes, state.motion, state.position, state.limit, dt, solver._no_reasons, False)
     return allowed
 
 

@@ -72,7 +72,7 @@ def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     patches = Patches(state.host)
     met = PatchPairs(patches)
     met.set_margin(0.0)
-    met.look(state)
+    met.look(state)()
     collides = ti.ndarray(ti.i32, 1)
     collides.fill(1)
     met.meet(1.0, 1.0, collides)
@@ -123,7 +123,7 @@ def finish(state, pairs: SelfCollision, predicted: ti.Ndarray | None = None) -> 
     is_changed = predicted is not None
     return pairs.finish(
         state, predicted if is_changed else state.displacement, ContactList(1), 0, is_changed=is_changed
-    )
+    )()
 
 
 def crumple(state, pairs: SelfCollision, count: int) -> None:
@@ -264,6 +264,7 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
         state.displacement.from_numpy(step.astype(np.float32))
         before = pairs.patch_pairs.count, pairs.searches
         pairs.look(state)
+        pairs.looked()
         is_met, known = (
             pairs._is_outrun and before[0] > 0,
             pairs.patch_pairs.on_device.slack.to_numpy()[: before[0]] > 0.0,

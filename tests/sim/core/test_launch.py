@@ -67,6 +67,15 @@ def refuse_doubles(numbers: Floats):
         numbers[i] = 0.0
 
 
+def test_results_can_be_asked_for_later(taichi_cpu):
+    numbers = ti.ndarray(ti.f32, 3)
+    numbers.from_numpy(np.array([1.0, 2.0, 5.0], dtype=np.float32))
+    for _ in range(2):  # as it is compiled, and from then on
+        asked, counted = ends.later(numbers, 3), fill.later(numbers, 2, 0.0, 0, (0.0, 0.0, 0.0), (0, 0, 0))
+        assert (counted(), list(asked())) == (2, [1.0, 5.0])
+        numbers.from_numpy(np.array([1.0, 2.0, 5.0], dtype=np.float32))
+
+
 def test_later_calls_pass_every_argument_as_the_first_one_does(taichi_cpu):
     for count, factor, power, shift, cell in (
         (5, 2.0, 0, (1.0, 2.0, 3.0), (4, 5, 6)),
