@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
-from sim.rigid.contacts import AnchoredContacts, Array, Contacts, Indices, Key, reduce_manifold
+from sim.rigid.contacts import BODY_BITS, AnchoredContacts, Array, Contacts, Indices, reduce_manifold
 from sim.shapes.body_geometry import BodyGeometry
 
 CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
@@ -33,6 +33,8 @@ class CollisionDetector:
         """Take all bodies but the domain, and which of them forces move, (n,): pairs without one have no contacts."""
         self._geometries, self._walls = tuple(geometries), tuple(walls)
         self._domain = len(geometries)
+        if self._domain >= 1 << BODY_BITS:
+            raise ValueError(f"there are {self._domain:,} rigid bodies; at most {(1 << BODY_BITS) - 1:,} can meet")
         self._closed = np.array([[-np.inf] * 3, [np.inf] * 3])
         for wall in walls:
             self._closed[0 if wall.side > 0.0 else 1, wall.axis] = wall.offset
@@ -54,7 +56,7 @@ class CollisionDetector:
         self._found: list[list[AnchoredContacts]] = [[] for _ in self._first]
         self.followed = AnchoredContacts.joined([])
 
-    def find(self, poses: Poses, motion: Array, last: frozenset[Key]) -> Contacts:
+    def find(self, poses: Poses, motion: Array, last: Indices) -> Contacts:
         """The contacts of all bodies in poses, by pair, in order of their numbers, then those at walls.
 
         The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the last step,
@@ -101,7 +103,7 @@ class CollisionDetector:
             self._found[pair] = []
         return bool(dropped)
 
-    def _examine(self, pairs: Indices, poses: Poses, margin: Array, last: frozenset[Key]) -> bool:
+    def _examine(self, pairs: Indices, poses: Poses, margin: Array, last: Indices) -> bool:
         """Look for the contacts of some pairs that are near; whether there are, or were, any."""
         changed = False
         for pair in pairs.tolist():
@@ -114,7 +116,7 @@ class CollisionDetector:
             self._found[pair] = found
         return changed
 
-    def _between(self, a: int, b: int, poses: Poses, margin: float, last: frozenset[Key]) -> list[AnchoredContacts]:
+    def _between(self, a: int, b: int, poses: Poses, margin: float, last: Indices) -> list[AnchoredContacts]:
         """Contacts of two bodies: the balls of each against the distance of the other."""
         sides = [(0, a, b), (1, b, a)]
         for one_side in sides:
@@ -162,7 +164,7 @@ class CollisionDetector:
             )
         return _reduced(AnchoredContacts.joined(candidates), poses, last, margin) if candidates else []
 
-    def _at_walls(self, body: int, poses: Poses, margin: float, last: frozenset[Key]) -> list[AnchoredContacts]:
+    def _at_walls(self, body: int, poses: Poses, margin: float, last: Indices) -> list[AnchoredContacts]:
         """Contacts of a body with the walls."""
         lower, upper = (corner[body] for corner in self._boxes(poses))
         walls = [
@@ -204,5 +206,5 @@ def _transform(rotation: Array, points: Array, shift: Array) -> Array:
     return moved
 
 
-def _reduced(candidates: AnchoredContacts, poses: Poses, last: frozenset[Key], margin: float) -> list[AnchoredContacts]:
+def _reduced(candidates: AnchoredContacts, poses: Poses, last: Indices, margin: float) -> list[AnchoredContacts]:
     return [candidates.chosen(reduce_manifold(candidates.at(poses), last, margin=margin))]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
-from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, solve_positions
-from sim.rigid.contacts import Array, Contacts, Indices, Key
+from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_positions
+from sim.rigid.contacts import Array, Contacts, Indices, rows_of
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
@@ -48,15 +48,15 @@ class Outcome:
 
 
 class ContactResponse:
-    """Resolves the contacts of a step, starting from the impulses of the step before; gravity is in m/s².
+    """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
 
     Attributes:
-        last_keys: the contacts of the last step.
+        last_keys: the contacts of the last step, ascending.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
         self._surfaces, self._gravity = surfaces, gravity
-        self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), 1.0)
+        self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
     def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float) -> Outcome:
         """Change the velocities of the bodies so that contacts hold, bounce and rub over a step of dt [s].
@@ -65,7 +65,7 @@ class ContactResponse:
         """
         n = len(bodies)
         if not len(contacts):
-            self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), dt)
+            self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
             nobody = np.zeros(n, dtype=bool)
             return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody, 0, True)
         system = ContactSystem.build(contacts, bodies.position, bodies.inverse_mass, bodies.inverse_inertia())
@@ -75,7 +75,7 @@ class ContactResponse:
             contacts, bodies, approach=free[:, 0], restitution=restitution, gravity=self._gravity, dt=dt
         )
         weight = float(np.linalg.norm(self._gravity))
-        tolerance = RELATIVE_TOLERANCE * float(np.abs(free).max()) + WEIGHT_TOLERANCE * dt * weight
+        fastest = system.largest_of_islands(np.abs(free).max(axis=1))
         solution = solve_impacts(
             system,
             free,
@@ -83,62 +83,60 @@ class ContactResponse:
             least_normal=-np.maximum(contacts.gap, 0.0) / dt,
             friction=friction,
             start=self._starting_impulses(contacts, system, dt),
-            tolerance=tolerance,
+            tolerance=RELATIVE_TOLERANCE * fastest + WEIGHT_TOLERANCE * dt * weight,
         )
-        change = system.body_velocities(solution.impulses)
-        bodies.velocity, bodies.angular_velocity = bodies.velocity + change[0], bodies.angular_velocity + change[1]
+        bodies.velocity = bodies.velocity + solution.change[:, :3]
+        bodies.angular_velocity = bodies.angular_velocity + solution.change[:, 3:]
         in_world = np.einsum("kc,kci->ki", solution.impulses, system.axes)
-        self._keep(contacts.keys, np.where(bounces.happens[:, None], 0.0, in_world), dt)
+        self._keep(contacts.keys, np.where(bounces.happens[:, None], 0.0, in_world) / dt)
 
         normal_velocity = system.velocities(bodies.velocity, bodies.angular_velocity)[:, 0]
-        extra, iterations, converged = self._separate(contacts, system, bounces, normal_velocity, dt)
+        separation = self._separate(contacts, system, bounces, normal_velocity, dt)
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
         pushed = solution.impulses[:, 0] > 0.0
         for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
             touched[np.minimum(body[pushed], n)] = True
             held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
         return Outcome(
-            *extra, touched[:n], held[:n], solution.iterations + iterations, solution.converged and converged
+            separation.change[:, :3],
+            separation.change[:, 3:],
+            touched[:n],
+            held[:n],
+            solution.iterations + separation.iterations,
+            solution.converged and separation.converged,
         )
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """The impulses that the next step starts from."""
-        return {
-            "contact_keys": self._keys.copy(),
-            "contact_impulses": self._impulses.copy(),
-            "contact_dt": np.array([self._dt]),
-        }
+        """The forces that the next step starts from."""
+        return {"contact_keys": self.last_keys.copy(), "contact_forces": self._forces.copy()}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint. Raises ValueError when an array is missing."""
-        for name in ("contact_keys", "contact_impulses", "contact_dt"):
+        for name in ("contact_keys", "contact_forces"):
             if name not in arrays:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
-        keys = np.asarray(arrays["contact_keys"]).astype(np.int64).reshape(-1, 3)
-        impulses = np.asarray(arrays["contact_impulses"]).astype(np.float64).reshape(-1, 3)
-        self._keep(keys, impulses, float(arrays["contact_dt"][0]))
+        keys, forces = np.asarray(arrays["contact_keys"]), np.asarray(arrays["contact_forces"])
+        self._keep(keys.astype(np.int64), forces.astype(np.float64).reshape(-1, 3))
 
-    def _keep(self, keys: Indices, impulses: Array, dt: float) -> None:
-        self._keys, self._impulses, self._dt = keys, impulses, dt
-        self._row_of: dict[Key, int] = {(a, b, feature): row for row, (a, b, feature) in enumerate(keys.tolist())}
-        self.last_keys = frozenset(self._row_of)
+    def _keep(self, keys: Indices, forces: Array) -> None:
+        order = np.argsort(keys)
+        self.last_keys, self._forces = keys[order], forces[order]
 
     def _starting_impulses(self, contacts: Contacts, system: ContactSystem, dt: float) -> Array:
-        """The impulses of the same contacts in the last step, scaled to this one, along the axes, (k, 3)."""
-        rows = np.array([self._row_of.get((a, b, feature), -1) for a, b, feature in contacts.keys.tolist()])
-        if not np.any(rows >= 0):
+        """The forces at the same contacts in the last step times dt [s], along the axes, (k, 3)."""
+        if not len(self.last_keys):
             return np.zeros((len(contacts), 3))
-        in_world = np.where((rows >= 0)[:, None], (dt / self._dt) * self._impulses[rows], 0.0)
+        rows, is_known = rows_of(contacts.keys, self.last_keys)
+        in_world = np.where(is_known[:, None], dt * self._forces[rows], 0.0)
         return np.einsum("kci,ki->kc", system.axes, in_world)
 
     def _separate(
         self, contacts: Contacts, system: ContactSystem, bounces: Bounces, normal_velocity: Array, dt: float
-    ) -> tuple[tuple[Array, Array], int, bool]:
+    ) -> Solution:
         """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
         overlap = -contacts.gap - SLOP
-        n = system.jacobian.shape[2]
         if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
-            return (np.zeros((n, 3)), np.zeros((n, 3))), 0, True
+            return Solution(np.zeros((len(contacts), 3)), np.zeros((system.body_count, 6)), 0, True)
         rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
         # Contacts that do not overlap may close by what the velocities leave of their gaps.
         wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
@@ -146,6 +144,5 @@ class ContactResponse:
         wanted = np.where(
             bounces.is_placed, bounces.displacement(normal_velocity, contacts.gap) / dt - normal_velocity, wanted
         )
-        tolerance = WEIGHT_TOLERANCE * float(np.abs(wanted).max())
-        solution = solve_positions(system, wanted, two_sided=bounces.is_placed, tolerance=tolerance)
-        return system.body_velocities(solution.impulses), solution.iterations, solution.converged
+        tolerance = WEIGHT_TOLERANCE * system.largest_of_islands(np.abs(wanted))
+        return solve_positions(system, wanted, two_sided=bounces.is_placed, tolerance=tolerance)

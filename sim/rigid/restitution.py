@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
 from sim.rigid.contacts import Array, Contacts
@@ -84,7 +83,7 @@ def solve_impacts(
     least_normal: Array,
     friction: Array,
     start: Array,
-    tolerance: float,
+    tolerance: Array,
 ) -> Solution:
     """Impulses with Newton's restitution, as far as energy allows; arguments as those of `solve_velocities`.
 
@@ -110,12 +109,13 @@ def solve_impacts(
         least_normal=bounces.least_velocity(least_normal, share=1.0),
         start=(1.0 + bounces.restitution)[:, None] * before,
     )
-    islands = _islands(system)
+    islands = system.islands
     step = newton.impulses - before
     fall = np.stack([bounces.fall, np.zeros_like(bounces.fall), np.zeros_like(bounces.fall)], axis=1)
     # Mean velocity while an impulse acts, at the instant of the impact.
-    mean_before = free + 0.5 * system.velocity_changes(before) - fall
-    change = system.velocity_changes(step)
+    mean_before = free + 0.5 * system.relative(compression.change) - fall
+    change_of_bodies = newton.change - compression.change
+    change = system.relative(change_of_bodies)
     work_before, linear, quadratic = (
         np.bincount(islands, weights=terms)
         for terms in (
@@ -127,18 +127,17 @@ def solve_impacts(
     returned = -np.bincount(islands, weights=bounces.restitution**2 * before[:, 0] * mean_before[:, 0])
     most = np.maximum(np.minimum(work_before + returned, 0.0), work_before)
     share = np.array([_largest_share(*each) for each in zip(most - work_before, linear, quadratic, strict=True)])
+    # Of bodies that no impulse moves nothing changes, whatever their share.
+    share_of_bodies = np.zeros(system.body_count)
+    for side in range(2):
+        moves = system.movers[:, side] >= 0
+        share_of_bodies[system.movers[moves, side]] = share[islands[moves]]
     return Solution(
         before + share[islands][:, None] * step,
+        compression.change + share_of_bodies[:, None] * change_of_bodies,
         compression.iterations + newton.iterations,
         compression.converged and newton.converged,
     )
-
-
-def _islands(system: ContactSystem) -> NDArray[np.int64]:
-    """Numbers of the groups of contacts, (k,): impulses at one change velocities at others of its group only."""
-    k = len(system.axes)
-    is_linked = system.matrix.reshape(k, 3, k, 3).any(axis=(1, 3))
-    return connected_components(is_linked, directed=False)[1].astype(np.int64)
 
 
 def _largest_share(room: float, linear: float, quadratic: float) -> float:

@@ -36,10 +36,10 @@ def _overlaps(solver: RigidSolver) -> list[StartProblem]:
     is_dynamic = np.zeros(len(solver.all_geometries), dtype=bool)
     is_dynamic[: len(solver.bodies)] = solver.bodies.is_dynamic
     detector = CollisionDetector(solver.all_geometries, is_dynamic, ())
-    detector.find(poses, np.zeros(len(poses.position)), frozenset())
+    detector.find(poses, np.zeros(len(poses.position)), np.zeros(0, dtype=np.int64))
     deepest: dict[tuple[int, int], float] = {}
     found = detector.followed
-    for row, (first, second, _) in enumerate(found.keys().tolist()):
+    for row, (first, second) in enumerate(zip(found.first.tolist(), found.second.tolist(), strict=True)):
         owner, other = int(found.owner[row]), int(found.other[row])
         centre = poses.position[owner] + poses.rotation[owner] @ found.centre[row]
         in_other = (centre - poses.position[other]) @ poses.rotation[other]
