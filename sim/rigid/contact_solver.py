@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.rotation import cross
-from sim.rigid.contacts import Array, Contacts, Indices, tangent_basis
+from sim.rigid.contacts import Array, Contacts, Indices
 
 MAX_ITERATIONS = 100
 LARGEST_IMPULSE = 1.0e300  # [N s]: kernels know no infinity
@@ -119,6 +119,18 @@ def solve_positions(
     bias = np.zeros((k, 3))
     bias[:, 0] = -wanted
     return _sweep(system, bias, np.where(two_sided, -LARGEST_IMPULSE, 0.0), np.zeros(k), np.zeros((k, 3)), tolerance)
+
+
+def tangent_basis(normal: Array) -> Array:
+    """Two unit tangents a normal, (k, 2, 3), that depend on it continuously but at one pole (Duff et al. 2017)."""
+    x, y, z = normal.T
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    tangents = np.empty((len(normal), 2, 3))
+    tangents[:, 0, 0], tangents[:, 0, 1], tangents[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    tangents[:, 1, 0], tangents[:, 1, 1], tangents[:, 1, 2] = b, sign + y * y * a, -y
+    return tangents
 
 
 def _sweep(

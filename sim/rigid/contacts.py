@@ -13,15 +13,14 @@ from sim.core.motion.paths import Poses
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-BODY_BITS, FEATURE_BITS = 19, 24
-"""Of a contact's key: the first body, the second, which of the two the ball belongs to (one bit), and which it is."""
+BODY_BITS, FEATURE_BITS, WALL_BITS = 19, 24, 3
+"""Of a contact's key: the first body, the second, which of the two the ball belongs to (one bit), and which it is.
+
+The highest bits of a feature are the number of the wall that the ball meets."""
 
 SAME_PATCH = 0.9  # normals closer than this cosine (26°) belong to one patch of contact
 MOST_PATCHES = 4  # patches of one pair that are kept, deepest first: more normals than three hold a body in any pose
 KEPT_BONUS = 2.0e-3  # head start, in extents of the patch, of points of the last step: equal ones must not take turns
-_ANGLES = 2.0 * np.pi * (np.arange(8) + 0.29) / 8.0
-_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
-"""Eight directions find every corner of a convex patch with an angle under 135°; the offset avoids symmetry axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,51 +114,3 @@ def rows_of(keys: Indices, known: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     """Where keys stand among known ones, which ascend and are some, and whether they do, (k,) each."""
     rows = np.minimum(np.searchsorted(known, keys), len(known) - 1)
     return rows, known[rows] == keys
-
-
-def tangent_basis(normal: Array) -> Array:
-    """Two unit tangents a normal, (k, 2, 3), that depend on it continuously but at one pole (Duff et al. 2017)."""
-    x, y, z = normal.T
-    sign = np.where(z < 0.0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    tangents = np.empty((len(normal), 2, 3))
-    tangents[:, 0, 0], tangents[:, 0, 1], tangents[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    tangents[:, 1, 0], tangents[:, 1, 1], tangents[:, 1, 2] = b, sign + y * y * a, -y
-    return tangents
-
-
-def reduce_manifold(contacts: Contacts, last: Indices, *, margin: float) -> Indices:
-    """Rows of the contacts of a pair, one at least, to keep: by patches of like normals, deepest first; then ascending.
-
-    Those of the last step, by ascending keys, are preferred among equals; gaps up to a margin were looked for [m].
-    """
-    kept = []
-    remaining = np.arange(len(contacts))
-    for _ in range(MOST_PATCHES):
-        deepest = remaining[np.argmin(contacts.gap[remaining])]
-        normal = contacts.normal[deepest]
-        alike = contacts.normal[remaining] @ normal >= SAME_PATCH
-        kept.append(_corners(contacts, remaining[alike], deepest, normal, last, margin))
-        remaining = remaining[~alike]
-        if not len(remaining):
-            break
-    return np.concatenate(kept)
-
-
-def _corners(
-    contacts: Contacts, patch: Indices, deepest: np.int64, normal: Array, last: Indices, margin: float
-) -> Indices:
-    """The deepest point of a patch, and those that meet first when it is tilted in eight directions.
-
-    The tilt is a margin across the patch: of a flat face the corners are kept, of a bumpy or a round one the bumps
-    that it stands on. The outermost points alone, which may hang above, would let it sink from bump to bump.
-    """
-    if len(patch) <= 2:
-        return patch
-    along = (contacts.point[patch] @ tangent_basis(normal[None])[0].T) @ _DIRECTIONS
-    extent = np.ptp(along, axis=0).max()
-    if len(last):
-        along = along + (KEPT_BONUS * extent) * rows_of(contacts.keys[patch], last)[1][:, None]
-    reach = margin * along - extent * contacts.gap[patch, None]
-    return np.unique(np.append(patch[np.argmax(reach, axis=0)], deepest))

@@ -89,8 +89,7 @@ class RigidSolver:
         self.all_names = tuple(body.name for body in everybody)
         self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
-        can_move = np.concatenate([self.bodies.is_dynamic, np.zeros(len(fixed), dtype=bool)])
-        self._detector = CollisionDetector(self.all_geometries, can_move, self.walls)
+        self._detector = CollisionDetector(self.all_geometries, self.walls)
         self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
@@ -146,7 +145,8 @@ class RigidSolver:
         bodies.velocity = bodies.velocity + np.where(free, dt * self.gravity, 0.0)
         self._set_mean_velocities_of_kinematic_bodies(dt)
         reach = self._with_obstacles(dt * self._surface_speeds())
-        contacts = self._detector.find(self.poses(), reach, self._response.last_keys)
+        is_active = np.append(bodies.is_free, np.zeros(len(self._fixed_position) - 1, dtype=bool))
+        contacts = self._detector.find(self.poses(), reach, self._response.last_keys, is_active)
         outcome = self._response.resolve(contacts, bodies, dt)
         self._contact_count = len(contacts)
         self._iterations += outcome.iterations

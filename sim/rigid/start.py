@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sim.rigid.broad_phase import overlapping_pairs
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.solver import RigidSolver
 
@@ -32,19 +33,20 @@ def start_problems(solver: RigidSolver) -> list[StartProblem]:
 
 def _overlaps(solver: RigidSolver) -> list[StartProblem]:
     """Pairs of bodies of which one is dynamic, with the exact distance of the balls found to overlap."""
-    poses = solver.poses()
-    is_dynamic = np.zeros(len(solver.all_geometries), dtype=bool)
-    is_dynamic[: len(solver.bodies)] = solver.bodies.is_dynamic
-    detector = CollisionDetector(solver.all_geometries, is_dynamic, ())
-    detector.find(poses, np.zeros(len(poses.position)), np.zeros(0, dtype=np.int64))
+    poses, geometries = solver.poses(), solver.all_geometries
+    is_dynamic = np.append(solver.bodies.is_dynamic, np.zeros(len(geometries) - len(solver.bodies), dtype=bool))
+    pairs = overlapping_pairs(*CollisionDetector(geometries, ()).boxes(poses), is_dynamic)
     deepest: dict[tuple[int, int], float] = {}
-    found = detector.followed
-    for row, (first, second) in enumerate(zip(found.first.tolist(), found.second.tolist(), strict=True)):
-        owner, other = int(found.owner[row]), int(found.other[row])
-        centre = poses.position[owner] + poses.rotation[owner] @ found.centre[row]
-        in_other = (centre - poses.position[other]) @ poses.rotation[other]
-        depth = float(found.radius[row] - solver.all_geometries[other].signed_distance(in_other[None])[0])
-        deepest[first, second] = max(depth, deepest.get((first, second), 0.0))
+    for first, second in zip(*(numbers.tolist() for numbers in pairs), strict=True):
+        for owner, other in ((first, second), (second, first)):
+            balls = geometries[owner].balls
+            centres = poses.position[owner] + balls.centres.T @ poses.rotation[owner].T
+            in_other = (centres - poses.position[other]) @ poses.rotation[other]
+            low, high = geometries[other].bounds
+            near = np.all((in_other > low - balls.radii[:, None]) & (in_other < high + balls.radii[:, None]), axis=1)
+            distance = geometries[other].signed_distance(in_other[near])
+            depth = float(np.max(balls.radii[near] - distance, initial=0.0))
+            deepest[first, second] = max(depth, deepest.get((first, second), 0.0))
     problems = []
     for (first, second), depth in deepest.items():
         smaller = min(solver.all_geometries[number].shortest_edge for number in (first, second))
