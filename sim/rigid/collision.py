@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.motion.paths import Poses
+from sim.core.solver import Arrays
 from sim.core.walls import Wall
 from sim.rigid.broad_phase import overlapping_pairs
 from sim.rigid.collision_shapes import CollisionShapes
@@ -50,6 +51,31 @@ class CollisionDetector:
         self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.followed = AnchoredContacts.joined([])
 
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """The contacts that are being followed: bodies that rest on others than before would tremble."""
+        found = self.followed
+        return {
+            "near_pairs": self._pairs.copy(),
+            "near_budgets": self._budget.copy(),
+            "followed_numbers": np.stack([found.owner, found.other, found.side, found.feature], axis=1),
+            "followed_places": np.concatenate(
+                [found.centre, found.radius[:, None], found.anchor, found.outward], axis=1
+            ),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint. Raises ValueError when an array is missing."""
+        for name in ("near_pairs", "near_budgets", "followed_numbers", "followed_places"):
+            if name not in arrays:
+                raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
+        self._pairs = np.array(arrays["near_pairs"], dtype=np.int64)
+        self._budget = np.array(arrays["near_budgets"], dtype=np.float64)
+        owner, other, side, feature = np.array(arrays["followed_numbers"], dtype=np.int64).reshape(-1, 4).T
+        places = np.array(arrays["followed_places"], dtype=np.float64).reshape(-1, 10)
+        self.followed = AnchoredContacts(
+            owner, other, side, feature, places[:, :3], places[:, 3], places[:, 4:7], places[:, 7:]
+        )
+
     def find(self, poses: Poses, motion: Array, last: Indices, is_active: NDArray[np.bool_]) -> Contacts:
         """The contacts of all active bodies in poses, by pair, in order of their numbers.
 
@@ -88,7 +114,12 @@ class CollisionDetector:
 
     def follow(self, motion: Array) -> None:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
-        self._budget -= motion[self._pairs >> BODY_BITS] + motion[self._pairs & ((1 << BODY_BITS) - 1)]
+        first, second = self.near()
+        self._budget -= motion[first] + motion[second]
+
+    def near(self) -> tuple[Indices, Indices]:
+        """The pairs of bodies that were near in the last step, (p,) each; the domain is one."""
+        return self._pairs >> BODY_BITS, self._pairs & ((1 << BODY_BITS) - 1)
 
     def boxes(self, poses: Poses) -> tuple[Array, Array]:
         """Lower and upper corners of all bodies' axis-aligned boxes [m], (n, 3) each."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
 from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_positions
-from sim.rigid.contacts import Array, Contacts, Indices, rows_of
+from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
@@ -58,17 +58,20 @@ class ContactResponse:
         self._surfaces, self._gravity = surfaces, gravity
         self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
-    def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float) -> Outcome:
-        """Change the velocities of the bodies so that contacts hold, bounce and rub over a step of dt [s].
+    def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float, is_active: NDArray[np.bool_]) -> Outcome:
+        """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
+
+        These are all their contacts; what is known of those of other bodies stays.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
         n = len(bodies)
         if not len(contacts):
-            self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+            self._replace(contacts.keys, np.zeros((0, 3)), is_active)
             nobody = np.zeros(n, dtype=bool)
             return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody, 0, True)
-        system = ContactSystem.build(contacts, bodies.position, bodies.inverse_mass, bodies.inverse_inertia())
+        inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
+        system = ContactSystem.build(contacts, bodies.position, inverse_mass, bodies.inverse_inertia())
         free = system.velocities(bodies.velocity, bodies.angular_velocity)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         bounces = Bounces.find(
@@ -88,7 +91,7 @@ class ContactResponse:
         bodies.velocity = bodies.velocity + solution.change[:, :3]
         bodies.angular_velocity = bodies.angular_velocity + solution.change[:, 3:]
         in_world = np.einsum("kc,kci->ki", solution.impulses, system.axes)
-        self._keep(contacts.keys, np.where(bounces.happens[:, None], 0.0, in_world) / dt)
+        self._replace(contacts.keys, np.where(bounces.happens[:, None], 0.0, in_world) / dt, is_active)
 
         normal_velocity = system.velocities(bodies.velocity, bodies.angular_velocity)[:, 0]
         separation = self._separate(contacts, system, bounces, normal_velocity, dt)
@@ -117,6 +120,13 @@ class ContactResponse:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
         keys, forces = np.asarray(arrays["contact_keys"]), np.asarray(arrays["contact_forces"])
         self._keep(keys.astype(np.int64), forces.astype(np.float64).reshape(-1, 3))
+
+    def _replace(self, keys: Indices, forces: Array, is_active: NDArray[np.bool_]) -> None:
+        """Keep the forces of the contacts of active bodies, and those that were known of other bodies."""
+        first, second = bodies_of(self.last_keys)
+        among = np.append(is_active, False)
+        stays = ~(among[np.minimum(first, len(is_active))] | among[np.minimum(second, len(is_active))])
+        self._keep(np.concatenate([keys, self.last_keys[stays]]), np.concatenate([forces, self._forces[stays]]))
 
     def _keep(self, keys: Indices, forces: Array) -> None:
         order = np.argsort(keys)

@@ -50,7 +50,8 @@ class ContactSystem:
         jacobian[..., 3:] = sign * cross(arm[:, :, None], axes[:, None])
         response = np.empty_like(jacobian)
         response[..., :3] = jacobian[..., :3] * inverse_mass[number][:, :, None, None]
-        response[..., 3:] = np.einsum("kscj,ksij->ksci", jacobian[..., 3:], inverse_inertia[number])
+        inertia = np.where(moves[:, :, None, None], inverse_inertia[number], 0.0)
+        response[..., 3:] = np.einsum("kscj,ksij->ksci", jacobian[..., 3:], inertia)
         blocks = np.einsum("ksci,ksdi->kcd", jacobian, response)
         own = np.ascontiguousarray(blocks[:, *np.triu_indices(3)])
         movers = np.where(moves, bodies, -1).astype(np.int32)

@@ -110,6 +110,11 @@ def pair_keys(first: Indices, second: Indices) -> Indices:
     return (first << BODY_BITS) | second
 
 
+def bodies_of(keys: Indices) -> tuple[Indices, Indices]:
+    """The first and the second bodies of contacts, by their keys, (k,) each."""
+    return keys >> (FEATURE_BITS + 1 + BODY_BITS), (keys >> (FEATURE_BITS + 1)) & ((1 << BODY_BITS) - 1)
+
+
 def rows_of(keys: Indices, known: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     """Where keys stand among known ones, which ascend and are some, and whether they do, (k,) each."""
     rows = np.minimum(np.searchsorted(known, keys), len(known) - 1)
