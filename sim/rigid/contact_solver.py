@@ -57,11 +57,21 @@ class ContactSystem:
         movers = np.where(moves, bodies, -1).astype(np.int32)
         return cls(axes, bodies, movers, jacobian, response, own, _islands(movers, n), n)
 
-    def velocities(self, velocity: Array, angular_velocity: Array) -> Array:
-        """Velocities at the contacts, (k, 3), of the moving bodies' velocities, (n, 3) each."""
-        return self.relative(np.concatenate([velocity, angular_velocity], axis=1))
+    def chosen(self, rows: Indices) -> ContactSystem:
+        """The system of some of the contacts."""
+        movers = self.movers[rows]
+        return ContactSystem(
+            self.axes[rows],
+            self.bodies[rows],
+            movers,
+            self.jacobian[rows],
+            self.response[rows],
+            self.own[rows],
+            _islands(movers, self.body_count),
+            self.body_count,
+        )
 
-    def relative(self, of_bodies: Array) -> Array:
+    def velocities(self, of_bodies: Array) -> Array:
         """Velocities at the contacts, (k, 3), of velocities (v, omega) of the moving bodies, (n, 6)."""
         both = np.concatenate([of_bodies, np.zeros((1, 6))])[self.bodies]
         return np.einsum("ksci,ksi->kc", self.jacobian, both)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
-from sim.rigid.contacts import Array, Contacts
+from sim.rigid.contacts import Array, Contacts, Indices
 from sim.rigid.states import MovingBodies
 
 SLOWEST_BOUNCE = 0.02  # approach below which nothing bounces [m/s]; or two steps of gravity
@@ -63,6 +63,21 @@ class Bounces:
             fall=acceleration * rest,
         )
 
+    @classmethod
+    def none(cls, count: int) -> Bounces:
+        """No impacts, at so many contacts."""
+        no, zero = np.zeros(count, dtype=bool), np.zeros(count)
+        return cls(no, no, zero, zero, zero, zero)
+
+    def then(self, later: Bounces) -> Bounces:
+        """These impacts, but the later ones at contacts that have one."""
+        pairs = ((getattr(self, field.name), getattr(later, field.name)) for field in fields(self))
+        return Bounces(*(np.where(later.happens, after, before) for before, after in pairs))
+
+    def chosen(self, rows: Indices) -> Bounces:
+        """Those at some of the contacts."""
+        return Bounces(*(getattr(self, field.name)[rows] for field in fields(self)))
+
     def least_velocity(self, otherwise: Array, *, share: float) -> Array:
         """Least normal velocities at the end of the step [m/s], (k,), `otherwise` where contacts do not bounce.
 
@@ -82,7 +97,6 @@ def solve_impacts(
     bounces: Bounces,
     least_normal: Array,
     friction: Array,
-    start: Array,
     tolerance: Array,
 ) -> Solution:
     """Impulses with Newton's restitution, as far as energy allows; arguments as those of `solve_velocities`.
@@ -101,9 +115,8 @@ def solve_impacts(
     group of bodies that touch has its own s.
     """
     solve = partial(solve_velocities, system, free, friction=friction, tolerance=tolerance)
-    compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=start)
-    if not bounces.happens.any():
-        return compression
+    nothing = np.zeros_like(free)
+    compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=nothing)
     before = compression.impulses
     newton = solve(
         least_normal=bounces.least_velocity(least_normal, share=1.0),
@@ -113,9 +126,9 @@ def solve_impacts(
     step = newton.impulses - before
     fall = np.stack([bounces.fall, np.zeros_like(bounces.fall), np.zeros_like(bounces.fall)], axis=1)
     # Mean velocity while an impulse acts, at the instant of the impact.
-    mean_before = free + 0.5 * system.relative(compression.change) - fall
+    mean_before = free + 0.5 * system.velocities(compression.change) - fall
     change_of_bodies = newton.change - compression.change
-    change = system.relative(change_of_bodies)
+    change = system.velocities(change_of_bodies)
     work_before, linear, quadratic = (
         np.bincount(islands, weights=terms)
         for terms in (
