@@ -77,9 +77,14 @@ def sweep_islands(
     most_sweeps: ti.i32,
     impulses: Rows,
     change: Rows,
+    work: Rows,
     sweeps: Whole,
 ):
     """Solve every island until a sweep changes no contact velocity by more than a tolerance.
+
+    Sweeps are steps of a nonsmooth nonlinear conjugate gradient method (Silcowitz-Hansen, Niebe & Erleben 2010): what a
+    sweep changes is the negative gradient, and from one to the next the impulses go on along the direction before, by
+    the ratio of the squares of the gradients; where these grow, it starts anew. The last is a mere sweep.
 
     Args:
         order: contacts, island after island, (k,).
@@ -95,6 +100,7 @@ def sweep_islands(
         most_sweeps: after which an island is given up.
         impulses: to start from, and found [N s], (c, 3).
         change: of the bodies' velocities by these impulses, (n, 6): nothing at first.
+        work: room for impulses before a sweep, and for directions, (c, 6).
         sweeps: out: how many each island took, one more than the most where it was given up, (islands,).
     """
     for island in range(first.shape[0] - 1):
@@ -102,9 +108,14 @@ def sweep_islands(
         for at in range(begin, end):
             for row in range(3):
                 push(order[at], row, impulses[order[at], row], response, movers, change)
-        taken = most_sweeps + 1
+            for row in range(3):
+                work[order[at], 3 + row] = 0.0
+        taken, square_before = most_sweeps + 1, ti.cast(0.0, ti.f64)
         for sweep in range(most_sweeps):
-            largest = ti.cast(0.0, ti.f64)
+            largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+            for at in range(begin, end):
+                for row in range(3):
+                    work[order[at], row] = impulses[order[at], row]
             for at in range(begin, end):
                 # There and back: supports are seen from the ground up, and loads from the top down.
                 i = order[ti.select(sweep % 2 == 0, at, begin + end - 1 - at)]
@@ -131,4 +142,20 @@ def sweep_islands(
             if largest <= tolerance[island]:
                 taken = sweep + 1
                 break
+            for at in range(begin, end):
+                for row in range(3):
+                    square += (impulses[order[at], row] - work[order[at], row]) ** 2
+            ratio = ti.cast(0.0, ti.f64)
+            if 0.0 < square < square_before:
+                ratio = square / square_before
+            square_before = square
+            if sweep < most_sweeps - 1:
+                for at in range(begin, end):
+                    i = order[at]
+                    for row in range(3):
+                        ahead = ratio * work[i, 3 + row]
+                        work[i, 3 + row] = ahead + impulses[i, row] - work[i, row]
+                        if ahead != 0.0:
+                            impulses[i, row] += ahead
+                            push(i, row, ahead, response, movers, change)
         sweeps[island] = taken

@@ -168,6 +168,7 @@ def _sweep(
         MAX_ITERATIONS,
         impulses,
         change,
+        np.empty((k, 6)),
         sweeps,
     )
     most = int(sweeps.max())
