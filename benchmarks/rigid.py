@@ -155,7 +155,8 @@ def fall_in_blender(count: int, frames: int) -> dict[str, Any]:
         return [[*box.matrix_world.translation, *box.matrix_world.to_quaternion()] for box in boxes]
 
     stage.frame_set(1)
-    times, before = [], []
+    times: list[tuple[float, float]] = []
+    before: list[list[float]] = []
     for frame in range(2, frames + 2):
         before = poses() if frame == frames + 1 else before
         times.append(timed(lambda frame=frame: stage.frame_set(frame)))

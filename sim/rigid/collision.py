@@ -44,10 +44,6 @@ class CollisionDetector:
         self._centre = np.stack([geometry.bounds.mean(axis=0) for geometry in geometries])
         self._half_edges = np.stack([0.5 * np.ptp(geometry.bounds, axis=0) for geometry in geometries])
         self._size = np.array([*(geometry.shortest_edge for geometry in geometries), np.inf])
-        self.forget()
-
-    def forget(self) -> None:
-        """Examine every pair anew at the next step."""
         self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.followed = AnchoredContacts.joined([])
 

@@ -122,7 +122,8 @@ def sweep_islands(
                 old_n = impulses[i, 0]
                 w_n = bias[i, 0] + velocity_along(i, 0, jacobian, movers, change)
                 new_n = ti.max(old_n - w_n / own[i, 0], lowest[i])
-                if new_n != 0.0 or old_n != 0.0:
+                rubs = impulses[i, 1] != 0.0 or impulses[i, 2] != 0.0
+                if new_n != 0.0 or old_n != 0.0 or rubs:
                     push(i, 0, new_n - old_n, response, movers, change)
                     impulses[i, 0] = new_n
                     largest = ti.max(largest, own[i, 0] * ti.abs(new_n - old_n))

@@ -7,6 +7,7 @@ from rigid_scenes import ball, body, cube, in_room, in_space
 
 from sim.core.domain import DomainParameters
 from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Contacts
 from sim.rigid.solver import RigidSolver
 
@@ -17,10 +18,9 @@ NO_KEYS = np.zeros(0, dtype=np.int64)
 def contacts_of(solver: RigidSolver, within: float, last: np.ndarray = NO_KEYS) -> Contacts:
     """All contacts with gaps up to some length [m], at least."""
     count = len(solver.all_geometries)
-    solver._detector.forget()
-    return solver._detector.find(
-        solver.poses(), np.full(count + 1, within), last, np.arange(count) < len(solver.bodies)
-    )
+    moves = np.arange(count) < len(solver.bodies)
+    detector = CollisionDetector(solver.all_geometries, solver.walls)
+    return detector.find(solver.poses(), np.full(count + 1, within), last, moves)
 
 
 @pytest.mark.parametrize(
