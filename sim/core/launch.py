@@ -299,3 +299,12 @@ def _is_same(number: Any, before: Any) -> bool:
 def kernel(function: Callable[..., Any]) -> FastKernel:
     """Decorator in place of `ti.kernel`: the kernel may take bundles, and its launches are fast."""
     return FastKernel(ti.kernel(with_fields_as_arguments(function)))
+
+
+def kernel_of_host_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator in place of `ti.kernel`: the kernel may take bundles of numpy's arrays, which Taichi itself passes on.
+
+    For arrays whose sizes change from launch to launch: one costs some 10 us, and on a GPU its way there and back.
+    """
+    launched = ti.kernel(with_fields_as_arguments(function))
+    return functools.wraps(function)(lambda *args: launched(*flattened(args)))

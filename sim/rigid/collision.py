@@ -181,33 +181,24 @@ class CollisionDetector:
         """Contacts of some pairs that are near, in their order."""
         if not len(first):
             return AnchoredContacts.joined([])
-        from sim.rigid.collision_kernels import MOST_KEPT, find_contacts
+        from sim.rigid.collision_kernels import MOST_KEPT, Bodies, Found, Tasks, find_contacts
 
         shapes, count = self._shapes, len(first)
         sides = np.where(wall >= 0, 1, shapes.sides(first, np.minimum(second, self._domain - 1)))
+        pairs = np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32)
+        walls = [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls]
         counts = np.zeros(count, dtype=np.int32)
         features, planes = np.empty((count * MOST_KEPT, 2), dtype=np.int32), np.empty((count * MOST_KEPT, 6))
         find_contacts(
-            np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32),
-            self._margin(first, second, motion),
-            np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1),
-            shapes.of_body,
-            np.array(
-                [[wall.axis, wall.side, wall.offset, *wall.lower, *wall.upper] for wall in self._walls] or [[0.0] * 7]
-            ),
+            Tasks(pairs, self._margin(first, second, motion)),
+            Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body),
+            np.array(walls or [[0.0] * 7]),
             np.concatenate([[-1], last]),
-            shapes.whole,
-            shapes.sizes,
-            shapes.balls,
-            shapes.clusters,
-            shapes.values,
-            shapes.edges,
+            shapes.tables,
             2 * shapes.most_balls,
             BLOCKS,
             self._work,
-            counts,
-            features,
-            planes,
+            Found(counts, features, planes),
         )
         task = np.repeat(np.arange(count), counts)
         rows = np.arange(len(task)) - np.repeat(np.cumsum(counts) - counts, counts) + MOST_KEPT * task

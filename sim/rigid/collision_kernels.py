@@ -1,9 +1,12 @@
 """Contacts of pairs of bodies that are near: the balls of each against the distance of the other, reduced to few."""
 
 import math
+from typing import NamedTuple
 
 import taichi as ti
 
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel_of_host_arrays
 from sim.rigid.contacts import BODY_BITS, FEATURE_BITS, KEPT_BONUS, MOST_PATCHES, SAME_PATCH, WALL_BITS
 
 Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -31,6 +34,43 @@ FAR = 1.0e30  # more than any length, and a number in float32, as kernels read i
 _HALF_CELL_DIAGONAL = 0.87  # by which grids err at most, in cells
 
 
+@bundle
+class Shapes(NamedTuple):
+    """Shapes of bodies, each once."""
+
+    whole: WholeRows  # whole numbers, by the columns above, (s, 11)
+    sizes: Rows  # other numbers, likewise, (s, 19)
+    balls: Rows  # centre, radius, axis, cone of the balls of all shapes, (m, 8)
+    clusters: Rows  # centre and radius of each `BALLS_PER_CLUSTER` of them, (c, 4)
+    values: Distances  # distances at the nodes of all grids [m]
+    edges: Rows  # start and extent of the edges of all profiles, (e, 4)
+
+
+@bundle
+class Bodies(NamedTuple):
+    """Where bodies are."""
+
+    pose: Rows  # position and rotation, row by row, (b, 12)
+    shape: Whole  # number of the shape, (b,)
+
+
+@bundle
+class Tasks(NamedTuple):
+    """Pairs to be looked at."""
+
+    pairs: WholeRows  # first and second body, the wall that stands for the second or -1, whose balls: 1, 2, 3 both
+    margins: Numbers  # gap up to which contacts are looked for [m], (t,)
+
+
+@bundle
+class Found(NamedTuple):
+    """Contacts of the pairs."""
+
+    counts: Whole  # of each pair, (t,)
+    features: WholeRows  # side and number of the ball of each, (t MOST_KEPT, 2)
+    planes: Rows  # anchor [m] and normal in the other's frame, (t MOST_KEPT, 6)
+
+
 @ti.func
 def vector_at(table: ti.template(), row: ti.i32, column: ti.i32) -> Vector3:
     """Three numbers of a table."""
@@ -55,14 +95,14 @@ def turned_back(pose: Rows, body: ti.i32, v: Vector3) -> Vector3:
     return result
 
 
-@ti.func
-def grid_distance(p: Vector3, shape: ti.i32, whole: WholeRows, sizes: Rows, values: Distances) -> ti.f64:
+@func
+def grid_distance(p: Vector3, shape: ti.i32, shapes: Shapes) -> ti.f64:
     """Trilinear interpolation; outside of the grid that of the nearest point of it, plus the way there."""
-    spacing = sizes[shape, SPACING]
-    place = (p - vector_at(sizes, shape, ORIGIN)) / spacing
+    spacing = shapes.sizes[shape, SPACING]
+    place = (p - vector_at(shapes.sizes, shape, ORIGIN)) / spacing
     nearest, share, cell = Vector3(0.0), Vector3(0.0), ti.Vector([0, 0, 0])
     for axis in ti.static(range(3)):
-        nodes = whole[shape, NODES + axis]
+        nodes = shapes.whole[shape, NODES + axis]
         nearest[axis] = ti.max(0.0, ti.min(place[axis], ti.cast(nodes - 1, ti.f64)))
         cell[axis] = ti.min(ti.cast(nearest[axis], ti.i32), nodes - 2)
         share[axis] = nearest[axis] - cell[axis]
@@ -72,17 +112,26 @@ def grid_distance(p: Vector3, shape: ti.i32, whole: WholeRows, sizes: Rows, valu
         wx = ti.static(1.0 - dx) + ti.static(2.0 * dx - 1.0) * share[0]
         wy = ti.static(1.0 - dy) + ti.static(2.0 * dy - 1.0) * share[1]
         wz = ti.static(1.0 - dz) + ti.static(2.0 * dz - 1.0) * share[2]
-        node = ((cell[0] + dx) * whole[shape, NODES + 1] + cell[1] + dy) * whole[shape, NODES + 2] + cell[2] + dz
-        value += wx * wy * wz * values[whole[shape, FIRST_VALUE] + node]
+        node = (
+            ((cell[0] + dx) * shapes.whole[shape, NODES + 1] + cell[1] + dy) * shapes.whole[shape, NODES + 2]
+            + cell[2]
+            + dz
+        )
+        value += wx * wy * wz * shapes.values[shapes.whole[shape, FIRST_VALUE] + node]
     return value + spacing * (place - nearest).norm()
 
 
-@ti.func
-def profile_distance(r: ti.f64, z: ti.f64, first: ti.i32, count: ti.i32, edges: Rows) -> ti.f64:
+@func
+def profile_distance(r: ti.f64, z: ti.f64, first: ti.i32, count: ti.i32, shapes: Shapes) -> ti.f64:
     """Distance to the nearest edge, negative where a ray outwards crosses an odd number of edges."""
     square, crossings = ti.cast(FAR, ti.f64), 0
     for edge in range(first, first + count):
-        x, y, along_x, along_y = edges[edge, 0], edges[edge, 1], edges[edge, 2], edges[edge, 3]
+        x, y, along_x, along_y = (
+            shapes.edges[edge, 0],
+            shapes.edges[edge, 1],
+            shapes.edges[edge, 2],
+            shapes.edges[edge, 3],
+        )
         offset_x, offset_y = r - x, z - y
         share = (offset_x * along_x + offset_y * along_y) / (along_x * along_x + along_y * along_y)
         share = ti.max(0.0, ti.min(share, 1.0))
@@ -113,11 +162,11 @@ def cone_distance(radial: ti.f64, z: ti.f64, radius: ti.f64, height: ti.f64) -> 
     return ti.select(inside, -1.0, 1.0) * nearest
 
 
-@ti.func
-def distance_to(p: Vector3, shape: ti.i32, whole: WholeRows, sizes: Rows, values: Distances, edges: Rows) -> ti.f64:
+@func
+def distance_to(p: Vector3, shape: ti.i32, shapes: Shapes) -> ti.f64:
     """Distance to a shape [m], negative inside, of a point in the frame of its centre of mass."""
-    q = p + vector_at(sizes, shape, CENTRE)
-    kind, size = whole[shape, KIND], vector_at(sizes, shape, SIZE)
+    q = p + vector_at(shapes.sizes, shape, CENTRE)
+    kind, size = shapes.whole[shape, KIND], vector_at(shapes.sizes, shape, SIZE)
     radial = ti.sqrt(q[0] * q[0] + q[1] * q[1])
     distance = ti.cast(0.0, ti.f64)
     if kind == SPHERE:
@@ -136,23 +185,23 @@ def distance_to(p: Vector3, shape: ti.i32, whole: WholeRows, sizes: Rows, values
     elif kind == CONE:
         distance = cone_distance(radial, q[2], size[0], size[1])
     elif kind == PROFILE:
-        distance = profile_distance(radial, q[2], whole[shape, FIRST_EDGE], whole[shape, EDGES], edges)
+        distance = profile_distance(radial, q[2], shapes.whole[shape, FIRST_EDGE], shapes.whole[shape, EDGES], shapes)
     else:
-        distance = grid_distance(q, shape, whole, sizes, values)
+        distance = grid_distance(q, shape, shapes)
     return distance
 
 
-@ti.func
-def normal_of(p: Vector3, shape: ti.i32, whole: WholeRows, sizes: Rows, values: Distances, edges: Rows) -> Vector3:
+@func
+def normal_of(p: Vector3, shape: ti.i32, shapes: Shapes) -> Vector3:
     """Unit gradient of the distance; away from the centre of mass where it has none, as at the centre of a sphere."""
-    step = sizes[shape, STEP]
+    step = shapes.sizes[shape, STEP]
     gradient = Vector3(0.0)
     for side in range(6):
         q = p
         for axis in ti.static(range(3)):
             if side // 2 == axis:
                 q[axis] += ti.select(side % 2 == 0, step, -step)
-        value = distance_to(q, shape, whole, sizes, values, edges)
+        value = distance_to(q, shape, shapes)
         for axis in ti.static(range(3)):
             if side // 2 == axis:
                 gradient[axis] += ti.select(side % 2 == 0, value, -value) / (2.0 * step)
@@ -161,21 +210,19 @@ def normal_of(p: Vector3, shape: ti.i32, whole: WholeRows, sizes: Rows, values: 
     return gradient / gradient.norm()
 
 
-@ti.func
-def may_touch(
-    p: Vector3, within: ti.f64, shape: ti.i32, whole: WholeRows, sizes: Rows, values: Distances, edges: Rows
-) -> bool:
+@func
+def may_touch(p: Vector3, within: ti.f64, shape: ti.i32, shapes: Shapes) -> bool:
     """Whether a cluster of balls may come so near to a shape: its box is looked at, and its distance from below."""
-    low, high = vector_at(sizes, shape, LOW), vector_at(sizes, shape, HIGH)
+    low, high = vector_at(shapes.sizes, shape, LOW), vector_at(shapes.sizes, shape, HIGH)
     may = slab_distance(p - 0.5 * (low + high), 0.5 * (high - low)) <= within
     if may:
-        distance = distance_to(p, shape, whole, sizes, values, edges)
-        if whole[shape, KIND] == GRID:
-            q = p + vector_at(sizes, shape, CENTRE) - vector_at(sizes, shape, ORIGIN)
-            spacing = sizes[shape, SPACING]
+        distance = distance_to(p, shape, shapes)
+        if shapes.whole[shape, KIND] == GRID:
+            q = p + vector_at(shapes.sizes, shape, CENTRE) - vector_at(shapes.sizes, shape, ORIGIN)
+            spacing = shapes.sizes[shape, SPACING]
             distance -= _HALF_CELL_DIAGONAL * spacing
             for axis in ti.static(range(3)):
-                if q[axis] < 0.0 or q[axis] > spacing * (whole[shape, NODES + axis] - 1):
+                if q[axis] < 0.0 or q[axis] > spacing * (shapes.whole[shape, NODES + axis] - 1):
                     distance = 0.0  # beyond the grid it is known from above only
         may = distance <= within
     return may
@@ -256,83 +303,74 @@ def _angle(direction: int) -> float:
     return 2.0 * math.pi * (direction + 0.29) / 8.0
 
 
-@ti.kernel
+@kernel_of_host_arrays
 def find_contacts(
-    tasks: WholeRows,
-    margins: Numbers,
-    pose: Rows,
-    shape_of: Whole,
+    tasks: Tasks,
+    bodies: Bodies,
     walls: Rows,
     last: Keys,
-    whole: WholeRows,
-    sizes: Rows,
-    balls: Rows,
-    clusters: Rows,
-    values: Distances,
-    edges: Rows,
+    shapes: Shapes,
     room: ti.i32,
     blocks: ti.i32,
     work: Rows,
-    counts: Whole,
-    features: WholeRows,
-    planes: Rows,
+    found: Found,
 ):
     """Contacts of each pair: by patches of like normals, deepest first, few of each.
 
     Args:
-        tasks: first and second body, the wall that stands for the second or -1, and which of the two have balls that
-            are to be looked at (1, 2, or 3 for both), (t, 4).
-        margins: up to which gap contacts are looked for [m], (t,).
-        pose: position of each body and its rotation, row by row, (b, 12).
-        shape_of: the shape of each body, (b,).
+        tasks: the pairs.
+        bodies: where they are.
         walls: axis, side, offset, corners of the rectangle on the two other axes, (w, 7).
         last: ascending keys of the contacts of the last step, -1 first.
-        whole, sizes: numbers of shapes, as the columns above tell, (s, 11) and (s, 19).
-        balls: centre, radius, axis, cone of the balls of all shapes, (m, 8).
-        clusters: centre and radius of each `BALLS_PER_CLUSTER` of them, (c, 4).
-        values: distances at the nodes of all grids [m].
-        edges: start and extent of the edges of all profiles, (e, 4).
+        shapes: of the bodies.
         room: most balls of a pair.
         blocks: of pairs, which are looked at one after the other in each.
         work: room for the candidates of each block, (blocks room, SCRATCH).
-        counts: out: contacts of each pair, (t,).
-        features: out: side and number of the ball of each, (t MOST_KEPT, 2).
-        planes: out: anchor [m] and normal in the other's frame, (t MOST_KEPT, 6).
+        found: out.
     """
     for block in range(blocks):
         begin = block * room
         task = block
-        while task < counts.shape[0]:
-            first, second, wall, sides = tasks[task, 0], tasks[task, 1], tasks[task, 2], tasks[task, 3]
-            margin, end = margins[task], begin
+        while task < found.counts.shape[0]:
+            first, second, wall, sides = (
+                tasks.pairs[task, 0],
+                tasks.pairs[task, 1],
+                tasks.pairs[task, 2],
+                tasks.pairs[task, 3],
+            )
+            margin, end = tasks.margins[task], begin
             for side in range(2):
                 owner, other = ti.select(side == 0, first, second), ti.select(side == 0, second, first)
                 clusters_of_owner = 0
                 if (sides >> side) & 1 == 1:
-                    clusters_of_owner = whole[shape_of[owner], CLUSTERS]
+                    clusters_of_owner = shapes.whole[bodies.shape[owner], CLUSTERS]
                 for cluster in range(clusters_of_owner):
-                    own = shape_of[owner]
-                    row = whole[own, FIRST_CLUSTER] + cluster
-                    middle = turned(pose, owner, vector_at(clusters, row, 0)) + vector_at(pose, owner, 0)
+                    own = bodies.shape[owner]
+                    row = shapes.whole[own, FIRST_CLUSTER] + cluster
+                    middle = turned(bodies.pose, owner, vector_at(shapes.clusters, row, 0)) + vector_at(
+                        bodies.pose, owner, 0
+                    )
                     is_near = True
                     if wall >= 0:
                         axis = ti.cast(walls[wall, 0], ti.i32)
                         along = ti.cast(0.0, ti.f64)
                         for i in ti.static(range(3)):
                             along += ti.select(axis == i, middle[i], 0.0)
-                        is_near = walls[wall, 1] * (along - walls[wall, 2]) <= margin + clusters[row, 3]
+                        is_near = walls[wall, 1] * (along - walls[wall, 2]) <= margin + shapes.clusters[row, 3]
                     else:
-                        there = turned_back(pose, other, middle - vector_at(pose, other, 0))
-                        within = margin + clusters[row, 3]
-                        is_near = may_touch(there, within, shape_of[other], whole, sizes, values, edges)
+                        there = turned_back(bodies.pose, other, middle - vector_at(bodies.pose, other, 0))
+                        within = margin + shapes.clusters[row, 3]
+                        is_near = may_touch(there, within, bodies.shape[other], shapes)
                     balls_here = 0
                     if is_near:
-                        balls_here = ti.min(BALLS_PER_CLUSTER, whole[own, BALLS] - cluster * BALLS_PER_CLUSTER)
+                        balls_here = ti.min(BALLS_PER_CLUSTER, shapes.whole[own, BALLS] - cluster * BALLS_PER_CLUSTER)
                     for place in range(balls_here):
                         number = cluster * BALLS_PER_CLUSTER + place
-                        ball = whole[own, FIRST_BALL] + number
-                        radius = balls[ball, 3]
-                        centre = turned(pose, owner, vector_at(balls, ball, 0)) + vector_at(pose, owner, 0)
+                        ball = shapes.whole[own, FIRST_BALL] + number
+                        radius = shapes.balls[ball, 3]
+                        centre = turned(bodies.pose, owner, vector_at(shapes.balls, ball, 0)) + vector_at(
+                            bodies.pose, owner, 0
+                        )
                         outward, distance, touches = Vector3(0.0), ti.cast(0.0, ti.f64), False
                         if wall >= 0:
                             axis, is_beside = ti.cast(walls[wall, 0], ti.i32), True
@@ -347,22 +385,22 @@ def find_contacts(
                                     column += 1
                             touches = is_beside and distance <= margin + radius
                         else:
-                            against = shape_of[other]
-                            centre = turned_back(pose, other, centre - vector_at(pose, other, 0))
-                            if radius <= sizes[against, REACH]:
-                                distance = distance_to(centre, against, whole, sizes, values, edges)
+                            against = bodies.shape[other]
+                            centre = turned_back(bodies.pose, other, centre - vector_at(bodies.pose, other, 0))
+                            if radius <= shapes.sizes[against, REACH]:
+                                distance = distance_to(centre, against, shapes)
                                 if distance <= margin + radius:
-                                    outward = normal_of(centre, against, whole, sizes, values, edges)
-                                    axis_there = turned(pose, owner, vector_at(balls, ball, 4))
-                                    axis_there = turned_back(pose, other, axis_there)
+                                    outward = normal_of(centre, against, shapes)
+                                    axis_there = turned(bodies.pose, owner, vector_at(shapes.balls, ball, 4))
+                                    axis_there = turned_back(bodies.pose, other, axis_there)
                                     cosine = ti.max(-1.0, ti.min(-axis_there.dot(outward), 1.0))
-                                    touches = ti.acos(cosine) <= balls[ball, 7] + sizes[against, SLANT]
+                                    touches = ti.acos(cosine) <= shapes.balls[ball, 7] + shapes.sizes[against, SLANT]
                         if touches:
                             in_world = outward
                             point = centre - radius * outward
                             if wall < 0:
-                                in_world = turned(pose, other, outward)
-                                point = turned(pose, other, point) + vector_at(pose, other, 0)
+                                in_world = turned(bodies.pose, other, outward)
+                                point = turned(bodies.pose, other, point) + vector_at(bodies.pose, other, 0)
                             for i in ti.static(range(3)):
                                 work[end, i] = centre[i]
                                 work[end, 3 + i] = outward[i]
@@ -392,11 +430,11 @@ def find_contacts(
                         if use >= IN_PATCH:
                             work[c, 17] = DONE
                             row = task * MOST_KEPT + kept
-                            features[row, 0] = ti.cast(work[c, 15], ti.i32)
-                            features[row, 1] = ti.cast(work[c, 16], ti.i32)
+                            found.features[row, 0] = ti.cast(work[c, 15], ti.i32)
+                            found.features[row, 1] = ti.cast(work[c, 16], ti.i32)
                             for i in ti.static(range(3)):
-                                planes[row, i] = work[c, i] - work[c, 6] * work[c, 3 + i]
-                                planes[row, 3 + i] = work[c, 3 + i]
+                                found.planes[row, i] = work[c, i] - work[c, 6] * work[c, 3 + i]
+                                found.planes[row, 3 + i] = work[c, 3 + i]
                             kept += 1
-            counts[task] = kept
+            found.counts[task] = kept
             task += blocks

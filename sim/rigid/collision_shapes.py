@@ -34,7 +34,7 @@ class CollisionShapes:
 
     Attributes:
         of_body: number of the shape of each body, (b,) int32.
-        whole, sizes, balls, clusters, values, edges: as `find_contacts` takes them.
+        tables: as `find_contacts` takes them.
         most_balls: of a shape.
     """
 
@@ -71,9 +71,9 @@ class CollisionShapes:
             row[kernels.FIRST_CLUSTER], row[kernels.CLUSTERS] = sum(map(len, clusters)), len(groups)
             balls.append(own)
             clusters.append(groups)
-        self.whole, self.sizes = whole, sizes
-        self.balls, self.clusters = np.concatenate(balls), np.concatenate(clusters)
-        self.values, self.edges = np.concatenate(values), np.concatenate(edges)
+        self.tables = kernels.Shapes(
+            whole, sizes, *(np.concatenate(parts) for parts in (balls, clusters, values, edges))
+        )
         self.most_balls = int(whole[:, kernels.BALLS].max())
         if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
             raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
@@ -86,7 +86,8 @@ class CollisionShapes:
     def balls_of(self, body: Indices, feature: Indices) -> Array:
         """The balls that contacts name: centre, radius, axis, cone, (k, 8)."""
         number = feature & ((1 << (FEATURE_BITS - WALL_BITS)) - 1)
-        return self.balls[self.whole[self.of_body[body], kernels.FIRST_BALL] + number]
+        found: Array = self.tables.balls[self.tables.whole[self.of_body[body], kernels.FIRST_BALL] + number]
+        return found
 
 
 def _sides(one: BodyGeometry, two: BodyGeometry) -> int:

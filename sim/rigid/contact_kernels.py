@@ -1,6 +1,11 @@
 """Projected Gauss-Seidel on the impulses of contacts, island by island, in one launch."""
 
+from typing import NamedTuple
+
 import taichi as ti
+
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel_of_host_arrays
 
 Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
 Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
@@ -11,26 +16,39 @@ MAX_FRICTION_STEPS = 12
 FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
 
 
-@ti.func
-def velocity_along(i: ti.i32, row: ti.i32, jacobian: Rows, movers: Pairs, change: Rows) -> ti.f64:
+@bundle
+class System(NamedTuple):
+    """Contacts, (c,), and what is asked of them."""
+
+    movers: Pairs  # the two bodies of each, -1 where nothing moves it, (c, 2)
+    jacobian: Rows  # by body, axis and component, (c, 36)
+    response: Rows  # likewise, M⁻¹ Jᵀ
+    own: Rows  # block of A: nn, n1, n2, 11, 12, 22, (c, 6)
+    bias: Rows  # velocities without impulses, less the least normal ones [m/s], (c, 3)
+    lowest: Numbers  # bounds of the normal impulses from below [N s]
+    friction: Numbers  # coefficients mu [-]
+
+
+@func
+def velocity_along(i: ti.i32, row: ti.i32, system: System, change: Rows) -> ti.f64:
     """Change of the velocity at contact i along one of its axes, by the changes of its bodies' velocities."""
     along = ti.cast(0.0, ti.f64)
     for side in ti.static(range(2)):
-        body = movers[i, side]
+        body = system.movers[i, side]
         if body >= 0:
             for column in range(6):
-                along += jacobian[i, 18 * side + 6 * row + column] * change[body, column]
+                along += system.jacobian[i, 18 * side + 6 * row + column] * change[body, column]
     return along
 
 
-@ti.func
-def push(i: ti.i32, row: ti.i32, impulse: ti.f64, response: Rows, movers: Pairs, change: Rows):
+@func
+def push(i: ti.i32, row: ti.i32, impulse: ti.f64, system: System, change: Rows):
     """Add what an impulse along an axis of contact i changes of the velocities of its bodies."""
     for side in ti.static(range(2)):
-        body = movers[i, side]
+        body = system.movers[i, side]
         if body >= 0:
             for column in range(6):
-                change[body, column] += response[i, 18 * side + 6 * row + column] * impulse
+                change[body, column] += system.response[i, 18 * side + 6 * row + column] * impulse
 
 
 @ti.func
@@ -62,17 +80,11 @@ def friction_impulse(a_11: ti.f64, a_12: ti.f64, a_22: ti.f64, c_1: ti.f64, c_2:
     return x_1, x_2
 
 
-@ti.kernel
+@kernel_of_host_arrays
 def sweep_islands(
     order: Whole,
     first: Whole,
-    movers: Pairs,
-    jacobian: Rows,
-    response: Rows,
-    own: Rows,
-    bias: Rows,
-    lowest: Numbers,
-    friction: Numbers,
+    system: System,
     tolerance: Numbers,
     most_sweeps: ti.i32,
     impulses: Rows,
@@ -89,13 +101,7 @@ def sweep_islands(
     Args:
         order: contacts, island after island, (k,).
         first: where each island begins in `order`, and the end of the last, (islands + 1,).
-        movers: the two bodies of each contact, -1 where nothing moves it, (c, 2).
-        jacobian: of each contact, by body, axis and component, (c, 36).
-        response: likewise, M⁻¹ Jᵀ.
-        own: block of A of each contact: nn, n1, n2, 11, 12, 22, (c, 6).
-        bias: velocities at the contacts without impulses, less the least normal ones [m/s], (c, 3).
-        lowest: bounds of the normal impulses from below [N s], (c,).
-        friction: coefficients mu [-], (c,).
+        system: the contacts.
         tolerance: of each island [m/s], (islands,).
         most_sweeps: after which an island is given up.
         impulses: to start from, and found [N s], (c, 3).
@@ -107,7 +113,7 @@ def sweep_islands(
         begin, end = first[island], first[island + 1]
         for at in range(begin, end):
             for row in range(3):
-                push(order[at], row, impulses[order[at], row], response, movers, change)
+                push(order[at], row, impulses[order[at], row], system, change)
             for row in range(3):
                 work[order[at], 3 + row] = 0.0
         taken, square_before = most_sweeps + 1, ti.cast(0.0, ti.f64)
@@ -120,26 +126,27 @@ def sweep_islands(
                 # There and back: supports are seen from the ground up, and loads from the top down.
                 i = order[ti.select(sweep % 2 == 0, at, begin + end - 1 - at)]
                 old_n = impulses[i, 0]
-                w_n = bias[i, 0] + velocity_along(i, 0, jacobian, movers, change)
-                new_n = ti.max(old_n - w_n / own[i, 0], lowest[i])
+                w_n = system.bias[i, 0] + velocity_along(i, 0, system, change)
+                new_n = ti.max(old_n - w_n / system.own[i, 0], system.lowest[i])
                 rubs = impulses[i, 1] != 0.0 or impulses[i, 2] != 0.0
                 if new_n != 0.0 or old_n != 0.0 or rubs:
-                    push(i, 0, new_n - old_n, response, movers, change)
+                    push(i, 0, new_n - old_n, system, change)
                     impulses[i, 0] = new_n
-                    largest = ti.max(largest, own[i, 0] * ti.abs(new_n - old_n))
-                    if friction[i] > 0.0:
+                    largest = ti.max(largest, system.own[i, 0] * ti.abs(new_n - old_n))
+                    if system.friction[i] > 0.0:
                         old_1, old_2 = impulses[i, 1], impulses[i, 2]
                         # Slip without the tangential impulses of this contact.
-                        c_1 = bias[i, 1] + velocity_along(i, 1, jacobian, movers, change)
-                        c_2 = bias[i, 2] + velocity_along(i, 2, jacobian, movers, change)
-                        c_1 -= own[i, 3] * old_1 + own[i, 4] * old_2
-                        c_2 -= own[i, 4] * old_1 + own[i, 5] * old_2
-                        new_1, new_2 = friction_impulse(own[i, 3], own[i, 4], own[i, 5], c_1, c_2, friction[i] * new_n)
-                        push(i, 1, new_1 - old_1, response, movers, change)
-                        push(i, 2, new_2 - old_2, response, movers, change)
+                        c_1 = system.bias[i, 1] + velocity_along(i, 1, system, change)
+                        c_2 = system.bias[i, 2] + velocity_along(i, 2, system, change)
+                        a_11, a_12, a_22 = system.own[i, 3], system.own[i, 4], system.own[i, 5]
+                        c_1 -= a_11 * old_1 + a_12 * old_2
+                        c_2 -= a_12 * old_1 + a_22 * old_2
+                        new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, system.friction[i] * new_n)
+                        push(i, 1, new_1 - old_1, system, change)
+                        push(i, 2, new_2 - old_2, system, change)
                         impulses[i, 1], impulses[i, 2] = new_1, new_2
-                        largest = ti.max(largest, own[i, 3] * ti.abs(new_1 - old_1))
-                        largest = ti.max(largest, own[i, 5] * ti.abs(new_2 - old_2))
+                        largest = ti.max(largest, a_11 * ti.abs(new_1 - old_1))
+                        largest = ti.max(largest, a_22 * ti.abs(new_2 - old_2))
             if largest <= tolerance[island]:
                 taken = sweep + 1
                 break
@@ -158,5 +165,5 @@ def sweep_islands(
                         work[i, 3 + row] = ahead + impulses[i, row] - work[i, row]
                         if ahead != 0.0:
                             impulses[i, row] += ahead
-                            push(i, row, ahead, response, movers, change)
+                            push(i, row, ahead, system, change)
         sweeps[island] = taken

@@ -148,7 +148,7 @@ def _sweep(
     system: ContactSystem, bias: Array, lowest: Array, friction: Array, impulses: Array, tolerance: Array
 ) -> Solution:
     """Impulses from those given on, which are overwritten."""
-    from sim.rigid.contact_kernels import sweep_islands
+    from sim.rigid.contact_kernels import System, sweep_islands
 
     k = len(bias)
     order = np.argsort(system.islands, kind="stable").astype(np.int32)
@@ -157,13 +157,15 @@ def _sweep(
     sweep_islands(
         order,
         first,
-        system.movers,
-        system.jacobian.reshape(k, 36),
-        system.response.reshape(k, 36),
-        system.own,
-        bias,
-        lowest,
-        friction,
+        System(
+            system.movers,
+            system.jacobian.reshape(k, 36),
+            system.response.reshape(k, 36),
+            system.own,
+            bias,
+            lowest,
+            friction,
+        ),
         tolerance,
         MAX_ITERATIONS,
         impulses,
