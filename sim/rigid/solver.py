@@ -42,7 +42,9 @@ RUNAWAY_SPEED = 1.0e4  # no rigid body of a film moves at thirty times the speed
 class RigidSolver:
     """All dynamic and kinematic bodies of a scene; static bodies and the domain's closed faces are obstacles.
 
-    State in float64 on the host. One substep: gravity, contact impulses from the poses at its start, then the poses.
+    State in float64 on the host; contacts are found and solved in kernels, for which `sim.core.runtime.initialize` must
+    have run. One substep: gravity, contact impulses from the poses at its start, then the poses. Groups of bodies that
+    are too fast for it take several steps of their own, and groups that rest sleep (`steps`).
     Free flight is exact for constant gravity, and angular momentum is kept to round-off (`rotate_freely`). Impulses of
     contacts are equal and opposite at one point, so that contacts change neither the linear nor the angular momentum
     of bodies that nothing else holds.
@@ -202,20 +204,22 @@ class RigidSolver:
         return ~bodies.is_asleep
 
     def _put_to_sleep(self, dt: float) -> None:
-        """Let groups of bodies sleep that have rested for long enough; without gravity nothing rests."""
-        bodies, n = self.bodies, len(self.bodies)
+        """Let groups sleep that have rested long enough, beside nothing that is led; without gravity nothing rests."""
+        bodies, n, speeds = self.bodies, len(self.bodies), self._surface_speeds()
         awake = bodies.is_free & ~bodies.is_asleep
-        slow = self._surface_speeds() <= SLEEP_SHARE * LARGEST_DT * float(np.linalg.norm(self.gravity))
+        slow = speeds <= SLEEP_SHARE * LARGEST_DT * float(np.linalg.norm(self.gravity))
         bodies.rest_s = np.where(awake & slow, bodies.rest_s + dt, 0.0)
         rests = awake & (bodies.rest_s >= SLEEP_TIME_S)
         if not rests.any() or not self.gravity.any():
             return
-        first, second = self._detector.near()
-        free = np.append(awake, False)
-        links = free[np.minimum(first, n)] & free[np.minimum(second, n)]
+        first, second = (np.minimum(numbers, n) for numbers in self._detector.near())
+        free, leads = np.append(awake, False), np.append(~bodies.is_dynamic & (speeds > 0.0), False)
+        links = free[first] & free[second]
         groups = groups_of(first[links], second[links], n)
         restless = np.zeros(n, dtype=bool)
         np.logical_or.at(restless, groups, awake & ~rests)
+        for one, two in ((first, second), (second, first)):
+            restless[groups[one[free[one] & leads[two]]]] = True
         bodies.put_to_sleep(rests & ~restless[groups])
 
     def begin_frame(self, time_s: float) -> None:

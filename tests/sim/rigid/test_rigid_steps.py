@@ -107,6 +107,15 @@ def test_impulses_changes_and_supports_that_leave_wake_a_stack(how):
     assert not solver.bodies.is_asleep[:3].any()
 
 
+def test_a_stack_on_a_lift_that_creeps_stays_awake_and_rides_on():
+    support = {"type": "box", "size": (1.0, 1.0, 0.2)}
+    pit = DomainParameters(min=(-2.0, -2.0, -2.0), max=(2.0, 2.0, 4.0))
+    lift = body("lift", support, (0, 0, -0.1), kind="kinematic", velocity=(0.001, 0.0, 0.0))
+    solver = run(stack(lift, domain=pit), 1.0)
+    assert not solver.bodies.is_asleep.any()
+    np.testing.assert_allclose(solver.bodies.position[:3, 0], 0.001, rtol=0.01)  # it starts at rest: some slip
+
+
 def test_a_slow_body_without_gravity_goes_on_for_ever():
     solver = run(in_space(body("slow", cube(0.2), (0, 0, 1), velocity=(1e-4, 0.0, 0.0))), 2.0)
     assert not solver.bodies.is_asleep.any()
