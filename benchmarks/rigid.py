@@ -110,7 +110,8 @@ def measure_blender(count: int, frames: int) -> dict[str, Any]:
     before, after = (np.array(answer.pop(name)) for name in ("before", "after"))
     solver.bodies.position, solver.bodies.orientation = after[:, :3], after[:, 3:]
     solver.bodies.velocity = (after[:, :3] - before[:, :3]) * FRAMES_PER_SECOND
-    return {**answer, **frame_times(answer.pop("times")), "result": described(solver)}
+    times = frame_times(answer.pop("times"))
+    return {**answer, **times, "result": described(solver)}
 
 
 def fall_in_blender(count: int, frames: int) -> dict[str, Any]:
