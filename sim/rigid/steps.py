@@ -106,8 +106,8 @@ class StepChooser:
     def divided(self, poses: Poses, dt: float, is_active: NDArray[np.bool_]) -> list[tuple[int, NDArray[np.bool_]]]:
         """Numbers of steps that a step of dt [s] is made of, each with the dynamic bodies, (n,), that take so many.
 
-        Bodies that may meet take the same steps; a fast one shortens those of nobody else. Each body may get as fast as
-        the fastest of its group.
+        Bodies that may meet take the same steps; a fast one shortens those of nobody else. In groups that divide it
+        each body may get as fast as the fastest.
         """
         bodies = self._bodies
         is_free = bodies.is_free & is_active
@@ -116,12 +116,12 @@ class StepChooser:
         if self.needs_none(dt):
             return [(1, is_free)]
         groups, counts = self._counts(self.meetings(poses, dt, is_active), dt, is_free)
-        if counts.max() > 1:
-            speeds = bodies.surface_speeds(self._radius[: len(bodies)])
-            fastest = np.zeros(len(bodies))
-            np.maximum.at(fastest, groups, np.where(is_free, speeds, 0.0))
-            speeds = np.where(is_free, fastest[groups], speeds)
-            _, counts = self._counts(self.meetings(poses, dt, is_active, speeds), dt, is_free)
+        speeds = bodies.surface_speeds(self._radius[: len(bodies)])
+        fastest = np.zeros(len(bodies))
+        np.maximum.at(fastest, groups, np.where(is_free, speeds, 0.0))
+        faster = np.where(counts > 1, fastest[groups], speeds)
+        if np.any(faster > speeds):
+            _, counts = self._counts(self.meetings(poses, dt, is_active, faster), dt, is_free)
         return [(int(count), is_free & (counts == count)) for count in np.unique(counts[is_free])]
 
     def _counts(self, meetings: Meetings, dt: float, is_free: NDArray[np.bool_]) -> tuple[Indices, Indices]:
