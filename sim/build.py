@@ -176,6 +176,7 @@ def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
         return None
     obstacles = [body for body in scene.rigid if body.kind == "static"]
     solver = RigidSolver(moving, obstacles=obstacles, domain=scene.domain, gravity=scene.gravity)
+    solver.has_own_steps = not scene.fluid and not scene.cloth
     check_start(solver)
     return solver
 

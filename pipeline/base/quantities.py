@@ -159,8 +159,8 @@ WARNINGS = (
             "fluid": "it is denser there than density_tolerance asks, which shows as lost volume if it goes on; give "
             "more max_iterations or a smaller cfl",
             "smoke": "some air appears or vanishes, which hardly shows; give more projection_max_iterations",
-            "rigid": "bodies in contact may sink into each other or tremble; give fewer that touch, or masses less far "
-            "apart",
+            "rigid": "forces in a pile were not quite in balance, so that it may tremble, or sink in by the deepest "
+            "penetration that is told; start bodies nearer to where they rest, or give densities less far apart",
         },
     ),
     CountedEvent(

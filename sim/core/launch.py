@@ -333,3 +333,12 @@ def large_kernel(function: Callable[..., Any]) -> FastKernel:
     Serial and parallel variants of its loops may differ in their last bits.
     """
     return FastKernel(ti.kernel(with_fields_as_arguments(function)), is_large=True)
+
+
+def kernel_of_host_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator in place of `ti.kernel`: the kernel may take bundles of numpy's arrays, which Taichi itself passes on.
+
+    For arrays whose sizes change from launch to launch: one costs some 10 us, and on a GPU its way there and back.
+    """
+    launched = ti.kernel(with_fields_as_arguments(function))
+    return functools.wraps(function)(lambda *args: launched(*flattened(args)))

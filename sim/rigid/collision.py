@@ -1,21 +1,24 @@
-"""Where bodies touch: the balls of one against the distance of the other, looked for again when they have moved."""
+"""Where bodies touch, from step to step: pairs that are near are looked at again when they have moved."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.motion.paths import Poses
+from sim.core.solver import Arrays
 from sim.core.walls import Wall
-from sim.rigid.contacts import AnchoredContacts, Array, Contacts, Indices, Key, reduce_manifold
+from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.collision_shapes import CollisionShapes
+from sim.rigid.contacts import BODY_BITS, AnchoredContacts, Array, Contacts, Indices, pair_keys, rows_of
 from sim.shapes.body_geometry import BodyGeometry
 
 CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
 TRUSTED_MOTION = 1.0e-3  # contacts are looked for anew after surfaces moved so far, in the same unit
-SLANT = 0.03  # how far outside of a ball's cone a contact normal may be [rad]
-SLANT_ON_GRIDS = 0.3  # likewise, on distance grids, whose normals are no better than this [rad]
+BLOCKS = 32  # of pairs that are looked at side by side
 
 
 class CollisionDetector:
@@ -26,183 +29,189 @@ class CollisionDetector:
     (`AnchoredContacts`), all within that distance included.
 
     Attributes:
-        followed: the contacts that are being followed.
+        followed: the contacts that are being followed, by pair.
+
+    Raises:
+        ValueError: there are too many bodies for the keys of contacts.
     """
 
-    def __init__(self, geometries: Sequence[BodyGeometry], can_move: NDArray[np.bool_], walls: Sequence[Wall]) -> None:
-        """Take all bodies but the domain, and which of them forces move, (n,): pairs without one have no contacts."""
+    def __init__(self, geometries: Sequence[BodyGeometry], walls: Sequence[Wall]) -> None:
+        """Take all bodies but the domain."""
         self._geometries, self._walls = tuple(geometries), tuple(walls)
         self._domain = len(geometries)
-        self._closed = np.array([[-np.inf] * 3, [np.inf] * 3])
-        for wall in walls:
-            self._closed[0 if wall.side > 0.0 else 1, wall.axis] = wall.offset
+        if self._domain >= 1 << BODY_BITS:
+            raise ValueError(f"there are {self._domain:,} rigid bodies; at most {(1 << BODY_BITS) - 1:,} can meet")
         self._centre = np.stack([geometry.bounds.mean(axis=0) for geometry in geometries])
         self._half_edges = np.stack([0.5 * np.ptp(geometry.bounds, axis=0) for geometry in geometries])
-        size = np.array([geometry.shortest_edge for geometry in geometries])
-        first, second = np.triu_indices(len(geometries), k=1)
-        meets = can_move[first] | can_move[second]
-        at_walls = np.flatnonzero(can_move)
-        self._first = np.concatenate([first[meets], at_walls])
-        self._second = np.concatenate([second[meets], np.full(len(at_walls), self._domain)])
-        smaller = np.minimum(size[self._first], np.append(size, np.inf)[self._second])
-        self._band, self._trusted = CONTACT_BAND * smaller, TRUSTED_MOTION * smaller
-        self.forget()
-
-    def forget(self) -> None:
-        """Examine every pair anew at the next step."""
-        self._budget = np.full(len(self._first), -np.inf)
-        self._found: list[list[AnchoredContacts]] = [[] for _ in self._first]
+        self._size = np.array([*(geometry.shortest_edge for geometry in geometries), np.inf])
+        self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.followed = AnchoredContacts.joined([])
 
-    def find(self, poses: Poses, motion: Array, last: frozenset[Key]) -> Contacts:
-        """The contacts of all bodies in poses, by pair, in order of their numbers, then those at walls.
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """The contacts that are being followed: bodies that rest on others than before would tremble."""
+        found = self.followed
+        return {
+            "near_pairs": self._pairs.copy(),
+            "near_budgets": self._budget.copy(),
+            "followed_numbers": np.stack([found.owner, found.other, found.side, found.feature], axis=1),
+            "followed_places": np.concatenate(
+                [found.centre, found.radius[:, None], found.anchor, found.outward], axis=1
+            ),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint. Raises ValueError when an array is missing."""
+        for name in ("near_pairs", "near_budgets", "followed_numbers", "followed_places"):
+            if name not in arrays:
+                raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
+        self._pairs = np.array(arrays["near_pairs"], dtype=np.int64)
+        self._budget = np.array(arrays["near_budgets"], dtype=np.float64)
+        owner, other, side, feature = np.array(arrays["followed_numbers"], dtype=np.int64).reshape(-1, 4).T
+        places = np.array(arrays["followed_places"], dtype=np.float64).reshape(-1, 10)
+        self.followed = AnchoredContacts(
+            owner, other, side, feature, places[:, :3], places[:, 3], places[:, 4:7], places[:, 7:]
+        )
+
+    def find(self, poses: Poses, motion: Array, last: Indices, is_active: NDArray[np.bool_]) -> Contacts:
+        """The contacts of all active bodies in poses, by pair, in order of their numbers.
 
         The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the last step,
-        by their keys, are preferred among equals.
+        by their ascending keys, are preferred among equals. Contacts of bodies that are not active are kept.
         """
-        ahead = motion[self._first] + motion[self._second]
-        stale = np.flatnonzero(ahead > self._budget)
-        if len(stale):
-            margin = self._band + self._trusted + ahead
-            separation = self._separations(stale, poses)
-            near = separation <= margin[stale]
-            if self._examine(stale[near], poses, margin, last) | self._drop(stale[~near]):
-                self.followed = AnchoredContacts.joined([part for parts in self._found for part in parts])
-            # Boxes that are apart touch no sooner than they have come together.
-            apart = separation - self._band[stale]
-            self._budget[stale] = np.where(near, self._trusted[stale] + ahead[stale], apart)
-        return self.followed.at(poses)
+        lower, upper = self.boxes(poses)
+        first, second, wall = self._near(lower, upper, poses, motion, is_active)
+        pairs, of_task = np.unique(pair_keys(first, second), return_inverse=True)
+        ahead = motion[pairs >> BODY_BITS] + motion[pairs & ((1 << BODY_BITS) - 1)]
+        budget = np.full(len(pairs), -np.inf)
+        if len(self._pairs):
+            rows, is_known = rows_of(pairs, self._pairs)
+            budget[is_known] = self._budget[rows[is_known]]
+        is_stale = ahead > budget
+        budget = np.where(is_stale, self._trusted(pairs) + ahead, budget)
+
+        # What no active body belongs to stays as it is.
+        asleep = ~self._is_of(self._pairs, is_active)
+        stays = np.concatenate([pairs[~is_stale], self._pairs[asleep]])
+        owned = pair_keys(self.followed.first, self.followed.second)
+        kept = self.followed.chosen(np.flatnonzero(np.isin(owned, stays)))
+        tasks = np.flatnonzero(is_stale[of_task])
+        found = self._examine(first[tasks], second[tasks], wall[tasks], poses, motion, last)
+        if len(found) or len(kept) != len(self.followed):
+            joined = AnchoredContacts.joined([kept, found])
+            order = np.argsort(pair_keys(joined.first, joined.second), kind="stable")
+            self.followed = joined.chosen(order)
+        order = np.argsort(np.concatenate([pairs, self._pairs[asleep]]))
+        self._budget = np.concatenate([budget, self._budget[asleep]])[order]
+        self._pairs = np.concatenate([pairs, self._pairs[asleep]])[order]
+        if not asleep.any():
+            return self.followed.at(poses)
+        owned = pair_keys(self.followed.first, self.followed.second)
+        return self.followed.chosen(np.flatnonzero(self._is_of(owned, is_active))).at(poses)
 
     def follow(self, motion: Array) -> None:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
-        self._budget -= motion[self._first] + motion[self._second]
+        first, second = self.near()
+        self._budget -= motion[first] + motion[second]
 
-    def _separations(self, pairs: Indices, poses: Poses) -> Array:
-        """Lower bounds of the distances of some pairs [m], from their axis-aligned boxes; walls are planes."""
-        lower, upper = self._boxes(poses)
-        first, second = self._first[pairs], self._second[pairs]
-        walls = second == self._domain
-        partner = np.where(walls, 0, second)
-        between = np.maximum(lower[first] - upper[partner], lower[partner] - upper[first]).max(axis=1)
-        to_walls = np.minimum(lower[first] - self._closed[0], self._closed[1] - upper[first]).min(axis=1)
-        return np.where(walls, to_walls, between)
+    def near(self) -> tuple[Indices, Indices]:
+        """The pairs of bodies that were near in the last step, (p,) each; the domain is one."""
+        return self._pairs >> BODY_BITS, self._pairs & ((1 << BODY_BITS) - 1)
 
-    def _boxes(self, poses: Poses) -> tuple[Array, Array]:
+    def boxes(self, poses: Poses) -> tuple[Array, Array]:
         """Lower and upper corners of all bodies' axis-aligned boxes [m], (n, 3) each."""
         turned = poses.rotation[:-1]
         centre = poses.position[:-1] + np.einsum("nij,nj->ni", turned, self._centre)
         half = np.einsum("nij,nj->ni", np.abs(turned), self._half_edges)
         return centre - half, centre + half
 
-    def _drop(self, pairs: Indices) -> bool:
-        """Forget the contacts of pairs that are apart; whether there were any."""
-        dropped = [pair for pair in pairs.tolist() if self._found[pair]]
-        for pair in dropped:
-            self._found[pair] = []
-        return bool(dropped)
+    @cached_property
+    def _shapes(self) -> CollisionShapes:
+        return CollisionShapes(self._geometries)
 
-    def _examine(self, pairs: Indices, poses: Poses, margin: Array, last: frozenset[Key]) -> bool:
-        """Look for the contacts of some pairs that are near; whether there are, or were, any."""
-        changed = False
-        for pair in pairs.tolist():
-            a, b, within = int(self._first[pair]), int(self._second[pair]), float(margin[pair])
-            if b == self._domain:
-                found = self._at_walls(a, poses, within, last)
-            else:
-                found = self._between(a, b, poses, within, last)
-            changed |= bool(found) or bool(self._found[pair])
-            self._found[pair] = found
-        return changed
+    @cached_property
+    def _work(self) -> Array:
+        from sim.rigid.collision_kernels import SCRATCH
 
-    def _between(self, a: int, b: int, poses: Poses, margin: float, last: frozenset[Key]) -> list[AnchoredContacts]:
-        """Contacts of two bodies: the balls of each against the distance of the other."""
-        sides = [(0, a, b), (1, b, a)]
-        for one_side in sides:
-            if self._geometries[one_side[1]].sees_all_contacts_with(self._geometries[one_side[2]]):
-                sides = [one_side]
-                break
-        candidates = []
-        for side, owner, other in sides:
-            balls, obstacle = self._geometries[owner].balls, self._geometries[other]
-            relative = poses.rotation[other].T @ poses.rotation[owner]
-            shift = (poses.position[owner] - poses.position[other]) @ poses.rotation[other]
-            centres = _transform(relative, balls.centres, shift)
-            low, high = obstacle.bounds
-            outside = margin + balls.radii
-            is_near = balls.radii <= obstacle.reach
-            for axis in range(3):
-                is_near &= (centres[axis] >= low[axis] - outside) & (centres[axis] <= high[axis] + outside)
-            near = np.flatnonzero(is_near)
-            if not len(near):
-                continue
-            points = np.ascontiguousarray(centres[:, near].T)
-            distance = obstacle.contact_distance(points)
-            touching = distance <= margin + balls.radii[near]
-            near, points, distance = near[touching], points[touching], distance[touching]
-            if not len(near):
-                continue
-            outward = obstacle.contact_normal(points)
-            axes = _transform(relative, balls.axes[:, near], np.zeros(3))
-            slant = np.arccos(np.clip(-np.einsum("ik,ki->k", axes, outward), -1.0, 1.0))
-            facing = slant <= balls.cones[near] + (SLANT if obstacle.is_analytic else SLANT_ON_GRIDS)
-            near, points, distance, outward = near[facing], points[facing], distance[facing], outward[facing]
-            if not len(near):
-                continue
-            candidates.append(
-                AnchoredContacts(
-                    owner=np.full(len(near), owner),
-                    other=np.full(len(near), other),
-                    side=np.full(len(near), side),
-                    feature=near,
-                    centre=balls.centres[:, near].T,
-                    radius=balls.radii[near],
-                    anchor=points - distance[:, None] * outward,
-                    outward=outward,
-                )
+        return np.empty((BLOCKS * 2 * self._shapes.most_balls, SCRATCH))
+
+    def _is_of(self, pairs: Indices, is_active: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whether one body of a pair is active, (k,)."""
+        among = np.append(is_active, False)
+        result: NDArray[np.bool_] = among[pairs >> BODY_BITS] | among[pairs & ((1 << BODY_BITS) - 1)]
+        return result
+
+    def _trusted(self, pairs: Indices) -> Array:
+        """How far the surfaces of pairs may move until they are looked at again [m], (k,)."""
+        return TRUSTED_MOTION * self._smaller(pairs >> BODY_BITS, pairs & ((1 << BODY_BITS) - 1))
+
+    def _smaller(self, first: Indices, second: Indices) -> Array:
+        """Shortest edge of the smaller body of pairs [m], (k,)."""
+        return np.minimum(self._size[first], self._size[second])
+
+    def _margin(self, first: Indices, second: Indices, motion: Array) -> Array:
+        """Gap up to which contacts of pairs are looked for [m], (k,)."""
+        return (CONTACT_BAND + TRUSTED_MOTION) * self._smaller(first, second) + motion[first] + motion[second]
+
+    def _near(
+        self, lower: Array, upper: Array, poses: Poses, motion: Array, is_active: NDArray[np.bool_]
+    ) -> tuple[Indices, Indices, Indices]:
+        """Pairs whose boxes are within their margins, and the wall that is meant, or -1: (k,) each, by pair."""
+        reach = ((CONTACT_BAND + TRUSTED_MOTION) * self._size[:-1] + motion[:-1])[:, None]
+        first, second = overlapping_pairs(lower - reach, upper + reach, is_active)
+        apart = np.maximum(lower[first] - upper[second], lower[second] - upper[first]).max(axis=1)
+        near = apart <= self._margin(first, second, motion)
+        pairs = [(first[near], second[near], np.full(np.count_nonzero(near), -1))]
+        bodies = np.flatnonzero(is_active)
+        margin = self._margin(bodies, np.full(len(bodies), self._domain), motion)
+        for number, wall in enumerate(self._walls):
+            apart = (
+                lower[bodies, wall.axis] - wall.offset if wall.side > 0.0 else wall.offset - upper[bodies, wall.axis]
             )
-        return _reduced(AnchoredContacts.joined(candidates), poses, last, margin) if candidates else []
+            # A body that left by an open face falls on.
+            inside = wall.side * (poses.position[bodies, wall.axis] - wall.offset) > 0.0
+            at = bodies[(apart <= margin) & inside]
+            pairs.append((at, np.full(len(at), self._domain), np.full(len(at), number)))
+        first, second, wall_number = (np.concatenate(each) for each in zip(*pairs, strict=True))
+        order = np.lexsort((wall_number, second, first))
+        return first[order], second[order], wall_number[order]
 
-    def _at_walls(self, body: int, poses: Poses, margin: float, last: frozenset[Key]) -> list[AnchoredContacts]:
-        """Contacts of a body with the walls."""
-        lower, upper = (corner[body] for corner in self._boxes(poses))
-        walls = [
-            (number, wall)
-            for number, wall in enumerate(self._walls)
-            if wall.distance(lower, upper) <= margin and wall.holds(poses.position[body])
-        ]
-        if not walls:
-            return []
-        balls = self._geometries[body].balls
-        centres = _transform(poses.rotation[body], balls.centres, poses.position[body])
-        found = []
-        for number, wall in walls:
-            height = wall.side * (centres[wall.axis] - wall.offset)
-            near = np.flatnonzero((height <= margin + balls.radii) & wall.is_beside(centres))
-            if not len(near):
-                continue
-            normals = np.tile(wall.normal, (len(near), 1))
-            candidates = AnchoredContacts(
-                owner=np.full(len(near), body),
-                other=np.full(len(near), self._domain),
-                side=np.zeros(len(near), dtype=np.int64),
-                feature=near + number * len(balls.radii),
-                centre=balls.centres[:, near].T,
-                radius=balls.radii[near],
-                anchor=wall.offset * wall.side * normals,
-                outward=normals,
-            )
-            found += _reduced(candidates, poses, last, margin)
-        return found
+    def _examine(
+        self, first: Indices, second: Indices, wall: Indices, poses: Poses, motion: Array, last: Indices
+    ) -> AnchoredContacts:
+        """Contacts of some pairs that are near, in their order."""
+        if not len(first):
+            return AnchoredContacts.joined([])
+        from sim.rigid.collision_kernels import MOST_KEPT, Bodies, Found, Tasks, find_contacts
 
-
-def _transform(rotation: Array, points: Array, shift: Array) -> Array:
-    """Turned and moved points, (3, m)."""
-    x, y, z = points
-    moved = np.empty_like(points)
-    for i in range(3):
-        moved[i] = rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] * z + shift[i]
-    return moved
-
-
-def _reduced(candidates: AnchoredContacts, poses: Poses, last: frozenset[Key], margin: float) -> list[AnchoredContacts]:
-    return [candidates.chosen(reduce_manifold(candidates.at(poses), last, margin=margin))]
+        shapes, count = self._shapes, len(first)
+        sides = np.where(wall >= 0, 1, shapes.sides(first, np.minimum(second, self._domain - 1)))
+        pairs = np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32)
+        walls = [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls]
+        counts = np.zeros(count, dtype=np.int32)
+        features, planes = np.empty((count * MOST_KEPT, 2), dtype=np.int32), np.empty((count * MOST_KEPT, 6))
+        find_contacts(
+            Tasks(pairs, self._margin(first, second, motion)),
+            Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body),
+            np.array(walls or [[0.0] * 7]),
+            np.concatenate([[-1], last]),
+            shapes.tables,
+            2 * shapes.most_balls,
+            BLOCKS,
+            self._work,
+            Found(counts, features, planes),
+        )
+        task = np.repeat(np.arange(count), counts)
+        rows = np.arange(len(task)) - np.repeat(np.cumsum(counts) - counts, counts) + MOST_KEPT * task
+        side, feature = features[rows].astype(np.int64).T
+        owner = np.where(side == 0, first[task], second[task])
+        balls = shapes.balls_of(owner, feature)
+        return AnchoredContacts(
+            owner=owner,
+            other=np.where(side == 0, second[task], first[task]),
+            side=side,
+            feature=feature,
+            centre=balls[:, :3],
+            radius=balls[:, 3],
+            anchor=planes[rows, :3],
+            outward=planes[rows, 3:],
+        )

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
-from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, solve_positions
-from sim.rigid.contacts import Array, Contacts, Indices, Key
+from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_positions, solve_velocities
+from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
 SEPARATION_TIME_S, LARGEST_SEPARATION = 0.02, 0.2  # in which overlaps decay, and by what share a step at most
 SLOP = 1.0e-6  # overlap that stays [m]: below what anybody sees, above what rounding makes
+MOST_ROUNDS = 50  # of impacts in a step; after them what still approaches no longer bounces
 WEIGHT_TOLERANCE = 1.0e-4  # of the speed that gravity gives in a step: what the last sweep may still change
 
 
@@ -48,97 +49,161 @@ class Outcome:
 
 
 class ContactResponse:
-    """Resolves the contacts of a step, starting from the impulses of the step before; gravity is in m/s².
+    """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
 
     Attributes:
-        last_keys: the contacts of the last step.
+        last_keys: the contacts of the last step, ascending.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
         self._surfaces, self._gravity = surfaces, gravity
-        self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), 1.0)
+        self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
-    def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float) -> Outcome:
-        """Change the velocities of the bodies so that contacts hold, bounce and rub over a step of dt [s].
+    def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float, is_active: NDArray[np.bool_]) -> Outcome:
+        """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
+
+        These are all their contacts; what is known of those of other bodies stays.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
         n = len(bodies)
         if not len(contacts):
-            self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), dt)
+            self._replace(contacts.keys, np.zeros((0, 3)), is_active)
             nobody = np.zeros(n, dtype=bool)
             return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody, 0, True)
-        system = ContactSystem.build(contacts, bodies.position, bodies.inverse_mass, bodies.inverse_inertia())
-        free = system.velocities(bodies.velocity, bodies.angular_velocity)
+        inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
+        system = ContactSystem.build(contacts, bodies.position, inverse_mass, bodies.inverse_inertia())
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
-        bounces = Bounces.find(
-            contacts, bodies, approach=free[:, 0], restitution=restitution, gravity=self._gravity, dt=dt
-        )
-        weight = float(np.linalg.norm(self._gravity))
-        tolerance = RELATIVE_TOLERANCE * float(np.abs(free).max()) + WEIGHT_TOLERANCE * dt * weight
-        solution = solve_impacts(
+        least_normal = -np.maximum(contacts.gap, 0.0) / dt
+        velocity = np.concatenate([bodies.velocity, bodies.angular_velocity], axis=1)
+        impacts, bounces = self._bounce(contacts, bodies, system, velocity, friction, restitution, least_normal, dt)
+        free = system.velocities(velocity + impacts.change)
+        solution = solve_velocities(
             system,
             free,
-            bounces=bounces,
-            least_normal=-np.maximum(contacts.gap, 0.0) / dt,
+            least_normal=least_normal,
             friction=friction,
             start=self._starting_impulses(contacts, system, dt),
-            tolerance=tolerance,
+            tolerance=self._tolerance(system, free, dt),
         )
-        change = system.body_velocities(solution.impulses)
-        bodies.velocity, bodies.angular_velocity = bodies.velocity + change[0], bodies.angular_velocity + change[1]
+        velocity = velocity + impacts.change + solution.change
+        bodies.velocity, bodies.angular_velocity = velocity[:, :3], velocity[:, 3:]
         in_world = np.einsum("kc,kci->ki", solution.impulses, system.axes)
-        self._keep(contacts.keys, np.where(bounces.happens[:, None], 0.0, in_world), dt)
+        self._replace(contacts.keys, in_world / dt, is_active)
 
-        normal_velocity = system.velocities(bodies.velocity, bodies.angular_velocity)[:, 0]
-        extra, iterations, converged = self._separate(contacts, system, bounces, normal_velocity, dt)
+        normal_velocity = system.velocities(velocity)[:, 0]
+        separation = self._separate(contacts, system, bounces, normal_velocity, dt)
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
-        pushed = solution.impulses[:, 0] > 0.0
+        pushed = (solution.impulses[:, 0] > 0.0) | (impacts.impulses[:, 0] > 0.0)
         for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
             touched[np.minimum(body[pushed], n)] = True
             held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
         return Outcome(
-            *extra, touched[:n], held[:n], solution.iterations + iterations, solution.converged and converged
+            separation.change[:, :3],
+            separation.change[:, 3:],
+            touched[:n],
+            held[:n],
+            impacts.iterations + solution.iterations + separation.iterations,
+            impacts.converged and solution.converged and separation.converged,
         )
 
+    def _bounce(
+        self,
+        contacts: Contacts,
+        bodies: MovingBodies,
+        system: ContactSystem,
+        velocity: Array,
+        friction: Array,
+        restitution: Array,
+        least_normal: Array,
+        dt: float,
+    ) -> tuple[Solution, Bounces]:
+        """The impacts of a step in rounds: a blow goes through bodies that touch, or nearly, one after the other.
+
+        In each round contacts that approach bounce at once, together with those that never do; what can bounce and does
+        not approach is left out, so that it gets the blow in the next round (Smith, Kaufman, Vouga, Tamstorf &
+        Grinspun 2012, "Reflections on simultaneous impact"). Velocities (v, omega) of the bodies [m/s], [rad/s] are
+        those before, (n, 6).
+        """
+        k = len(contacts)
+        impulses, change, bounces = np.zeros((k, 3)), np.zeros((system.body_count, 6)), Bounces.none(k)
+        iterations, converged = 0, True
+        for rounds in range(MOST_ROUNDS + 1):
+            found = Bounces.find(
+                contacts,
+                bodies,
+                approach=system.velocities(velocity + change)[:, 0],
+                restitution=restitution,
+                gravity=self._gravity,
+                dt=dt,
+            )
+            if not found.happens.any():
+                break
+            if rounds == MOST_ROUNDS:
+                converged = False
+                break
+            bounces = bounces.then(found)
+            is_struck = np.zeros(int(system.islands.max()) + 1, dtype=bool)
+            is_struck[system.islands[found.happens]] = True
+            rows = np.flatnonzero(found.happens | ((restitution == 0.0) & is_struck[system.islands]))
+            part = system.chosen(rows)
+            free = part.velocities(velocity + change)
+            solution = solve_impacts(
+                part,
+                free,
+                bounces=found.chosen(rows),
+                least_normal=least_normal[rows],
+                friction=friction[rows],
+                tolerance=self._tolerance(part, free, dt),
+            )
+            impulses[rows] += solution.impulses
+            change += solution.change
+            iterations, converged = iterations + solution.iterations, converged and solution.converged
+        return Solution(impulses, change, iterations, converged), bounces
+
+    def _tolerance(self, system: ContactSystem, free: Array, dt: float) -> Array:
+        """What a sweep over each island may still change when it is the last [m/s], (islands,)."""
+        fastest = system.largest_of_islands(np.abs(free).max(axis=1))
+        return RELATIVE_TOLERANCE * fastest + WEIGHT_TOLERANCE * dt * float(np.linalg.norm(self._gravity))
+
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """The impulses that the next step starts from."""
-        return {
-            "contact_keys": self._keys.copy(),
-            "contact_impulses": self._impulses.copy(),
-            "contact_dt": np.array([self._dt]),
-        }
+        """The forces that the next step starts from."""
+        return {"contact_keys": self.last_keys.copy(), "contact_forces": self._forces.copy()}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint. Raises ValueError when an array is missing."""
-        for name in ("contact_keys", "contact_impulses", "contact_dt"):
+        for name in ("contact_keys", "contact_forces"):
             if name not in arrays:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
-        keys = np.asarray(arrays["contact_keys"]).astype(np.int64).reshape(-1, 3)
-        impulses = np.asarray(arrays["contact_impulses"]).astype(np.float64).reshape(-1, 3)
-        self._keep(keys, impulses, float(arrays["contact_dt"][0]))
+        keys, forces = np.asarray(arrays["contact_keys"]), np.asarray(arrays["contact_forces"])
+        self._keep(keys.astype(np.int64), forces.astype(np.float64).reshape(-1, 3))
 
-    def _keep(self, keys: Indices, impulses: Array, dt: float) -> None:
-        self._keys, self._impulses, self._dt = keys, impulses, dt
-        self._row_of: dict[Key, int] = {(a, b, feature): row for row, (a, b, feature) in enumerate(keys.tolist())}
-        self.last_keys = frozenset(self._row_of)
+    def _replace(self, keys: Indices, forces: Array, is_active: NDArray[np.bool_]) -> None:
+        """Keep the forces of the contacts of active bodies, and those that were known of other bodies."""
+        first, second = bodies_of(self.last_keys)
+        among = np.append(is_active, False)
+        stays = ~(among[np.minimum(first, len(is_active))] | among[np.minimum(second, len(is_active))])
+        self._keep(np.concatenate([keys, self.last_keys[stays]]), np.concatenate([forces, self._forces[stays]]))
+
+    def _keep(self, keys: Indices, forces: Array) -> None:
+        order = np.argsort(keys)
+        self.last_keys, self._forces = keys[order], forces[order]
 
     def _starting_impulses(self, contacts: Contacts, system: ContactSystem, dt: float) -> Array:
-        """The impulses of the same contacts in the last step, scaled to this one, along the axes, (k, 3)."""
-        rows = np.array([self._row_of.get((a, b, feature), -1) for a, b, feature in contacts.keys.tolist()])
-        if not np.any(rows >= 0):
+        """The forces at the same contacts in the last step times dt [s], along the axes, (k, 3)."""
+        if not len(self.last_keys):
             return np.zeros((len(contacts), 3))
-        in_world = np.where((rows >= 0)[:, None], (dt / self._dt) * self._impulses[rows], 0.0)
+        rows, is_known = rows_of(contacts.keys, self.last_keys)
+        in_world = np.where(is_known[:, None], dt * self._forces[rows], 0.0)
         return np.einsum("kci,ki->kc", system.axes, in_world)
 
     def _separate(
         self, contacts: Contacts, system: ContactSystem, bounces: Bounces, normal_velocity: Array, dt: float
-    ) -> tuple[tuple[Array, Array], int, bool]:
+    ) -> Solution:
         """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
         overlap = -contacts.gap - SLOP
-        n = system.jacobian.shape[2]
         if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
-            return (np.zeros((n, 3)), np.zeros((n, 3))), 0, True
+            return Solution(np.zeros((len(contacts), 3)), np.zeros((system.body_count, 6)), 0, True)
         rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
         # Contacts that do not overlap may close by what the velocities leave of their gaps.
         wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
@@ -146,6 +211,5 @@ class ContactResponse:
         wanted = np.where(
             bounces.is_placed, bounces.displacement(normal_velocity, contacts.gap) / dt - normal_velocity, wanted
         )
-        tolerance = WEIGHT_TOLERANCE * float(np.abs(wanted).max())
-        solution = solve_positions(system, wanted, two_sided=bounces.is_placed, tolerance=tolerance)
-        return system.body_velocities(solution.impulses), solution.iterations, solution.converged
+        tolerance = WEIGHT_TOLERANCE * system.largest_of_islands(np.abs(wanted))
+        return solve_positions(system, wanted, two_sided=bounces.is_placed, tolerance=tolerance)

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.rotation import cross
-from sim.rigid.contacts import Array, Contacts, tangent_basis
+from sim.rigid.contacts import Array, Contacts, Indices
 
 MAX_ITERATIONS = 100
-MAX_FRICTION_STEPS = 12
-FRICTION_ROUNDING = 1.0 + 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
+LARGEST_IMPULSE = 1.0e300  # [N s]: kernels know no infinity
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 
@@ -21,47 +22,65 @@ class ContactSystem:
     """The linear relation between impulses at contacts and velocities there.
 
     Contact i has three rows: the normal and two tangents. With the Jacobian J, mass matrix M and impulses λ the
-    velocities at the contacts are w = A λ + b, A = J M⁻¹ Jᵀ, b = J v.
+    velocities at the contacts are w = A λ + b, A = J M⁻¹ Jᵀ, b = J v. A contact knows two bodies, so that A is sparse;
+    it is never formed. Impulses in one island do not change velocities in another.
     """
 
     axes: Array  # normal and tangents, (k, 3, 3)
-    jacobian: Array  # of the moving bodies' velocities (v, omega), (k, 3, n, 6)
-    response: Array  # M⁻¹ Jᵀ, transposed, (k, 3, n, 6)
-    matrix: Array  # A, (3 k, 3 k)
+    bodies: Indices  # numbers of the two bodies, n where one does not belong to those that move, (k, 2)
+    movers: NDArray[np.int32]  # likewise, -1 where no impulse moves it
+    jacobian: Array  # of the velocities (v, omega) of the two bodies, (k, 2, 3, 6)
+    response: Array  # M⁻¹ Jᵀ, transposed, (k, 2, 3, 6)
+    own: Array  # the contact's own block of A: nn, n1, n2, 11, 12, 22, (k, 6)
+    islands: Indices  # numbers of the groups of contacts that hang together, (k,)
+    body_count: int  # n
 
     @classmethod
     def build(cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array) -> ContactSystem:
         """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
         k, n = len(contacts), len(position)
         axes = np.concatenate([contacts.normal[:, None], tangent_basis(contacts.normal)], axis=1)
-        jacobian = np.zeros((k, 3, n, 6))
-        for body, sign in ((contacts.first, 1.0), (contacts.second, -1.0)):
-            moving = np.flatnonzero(body < n)
-            number = body[moving]
-            arm = contacts.point[moving] - position[number]
-            jacobian[moving, :, number, :3] = sign * axes[moving]
-            jacobian[moving, :, number, 3:] = sign * cross(arm[:, None], axes[moving])
+        bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n)
+        moves = np.append(inverse_mass > 0.0, False)[bodies]
+        number = np.where(bodies < n, bodies, 0)
+        arm = contacts.point[:, None] - position[number]
+        sign = np.where(bodies < n, np.array([1.0, -1.0]), 0.0)[:, :, None, None]
+        jacobian = np.empty((k, 2, 3, 6))
+        jacobian[..., :3] = sign * axes[:, None]
+        jacobian[..., 3:] = sign * cross(arm[:, :, None], axes[:, None])
         response = np.empty_like(jacobian)
-        response[..., :3] = jacobian[..., :3] * inverse_mass[:, None]
-        response[..., 3:] = np.einsum("kcni,nij->kcnj", jacobian[..., 3:], inverse_inertia)
-        # No BLAS here: the bits of its products may depend on the number of threads.
-        matrix = np.einsum("ip,jp->ij", jacobian.reshape(3 * k, 6 * n), response.reshape(3 * k, 6 * n))
-        return cls(axes, jacobian, response, matrix)
+        response[..., :3] = jacobian[..., :3] * inverse_mass[number][:, :, None, None]
+        inertia = np.where(moves[:, :, None, None], inverse_inertia[number], 0.0)
+        response[..., 3:] = np.einsum("kscj,ksij->ksci", jacobian[..., 3:], inertia)
+        blocks = np.einsum("ksci,ksdi->kcd", jacobian, response)
+        own = np.ascontiguousarray(blocks[:, *np.triu_indices(3)])
+        movers = np.where(moves, bodies, -1).astype(np.int32)
+        return cls(axes, bodies, movers, jacobian, response, own, _islands(movers, n), n)
 
-    def velocities(self, velocity: Array, angular_velocity: Array) -> Array:
-        """Velocities at the contacts, (k, 3), of the moving bodies' velocities, (n, 3) each."""
-        both = np.concatenate([velocity, angular_velocity], axis=1)
-        return np.einsum("kcni,ni->kc", self.jacobian, both)
+    def chosen(self, rows: Indices) -> ContactSystem:
+        """The system of some of the contacts."""
+        movers = self.movers[rows]
+        return ContactSystem(
+            self.axes[rows],
+            self.bodies[rows],
+            movers,
+            self.jacobian[rows],
+            self.response[rows],
+            self.own[rows],
+            _islands(movers, self.body_count),
+            self.body_count,
+        )
 
-    def velocity_changes(self, impulses: Array) -> Array:
-        """Changes of the velocities at the contacts, (k, 3), by impulses (k, 3) along the axes."""
-        changes: Array = np.einsum("ij,j->i", self.matrix, impulses.reshape(-1))
-        return changes.reshape(-1, 3)
+    def velocities(self, of_bodies: Array) -> Array:
+        """Velocities at the contacts, (k, 3), of velocities (v, omega) of the moving bodies, (n, 6)."""
+        both = np.concatenate([of_bodies, np.zeros((1, 6))])[self.bodies]
+        return np.einsum("ksci,ksi->kc", self.jacobian, both)
 
-    def body_velocities(self, impulses: Array) -> tuple[Array, Array]:
-        """Changes of velocity and angular velocity, (n, 3) each, by impulses (k, 3) along the axes."""
-        both = np.einsum("kc,kcni->ni", impulses, self.response)
-        return both[:, :3], both[:, 3:]
+    def largest_of_islands(self, values: Array) -> Array:
+        """The largest value at the contacts of each island, none below 0, (islands,), of (k,)."""
+        largest = np.zeros(int(self.islands.max(initial=-1)) + 1)
+        np.maximum.at(largest, self.islands, values)
+        return largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +88,19 @@ class Solution:
     """Impulses and how they were found."""
 
     impulses: Array  # along the axes of the contacts [N s], (k, 3)
-    iterations: int  # sweeps over all contacts
-    converged: bool  # whether the last sweep changed less than the tolerance
+    change: Array  # of the velocities (v, omega) of the moving bodies by them, (n, 6)
+    iterations: int  # sweeps over all contacts of the island that took most
+    converged: bool  # whether the last sweep changed less than the tolerance, in all islands
 
 
 def solve_velocities(
-    system: ContactSystem, free: Array, *, least_normal: Array, friction: Array, start: Array, tolerance: float
+    system: ContactSystem, free: Array, *, least_normal: Array, friction: Array, start: Array, tolerance: Array
 ) -> Solution:
     """Impulses with w_n >= least_normal, λ_n >= 0, complementary, and Coulomb friction |λ_t| <= mu λ_n.
 
-    Sweeps over contacts; of each, first the normal impulse, then both tangential ones exactly for that normal one
-    (nonsmooth Gauss-Seidel; Jean 1999, "The non-smooth contact dynamics method"): they stop the slip if friction is
-    strong enough, else they are as large as it allows, and opposite to the slip that is left.
+    Sweeps over contacts, there and back; of each, first the normal impulse, then both tangential ones exactly for that
+    normal one (nonsmooth Gauss-Seidel; Jean 1999, "The non-smooth contact dynamics method"): they stop the slip if
+    friction is strong enough, else they are as large as it allows, and opposite to the slip that is left.
 
     Args:
         system: of the contacts.
@@ -88,44 +108,15 @@ def solve_velocities(
         least_normal: lower bound of the normal velocities [m/s], (k,).
         friction: coefficients mu [-], (k,).
         start: impulses to start from [N s], (k, 3).
-        tolerance: largest change of a contact velocity in the last sweep [m/s].
+        tolerance: largest change of a contact velocity in the last sweep of each island [m/s], (islands,).
     """
-    k = len(free)
     bias = free.copy()
     bias[:, 0] -= least_normal
-    rows = [np.ascontiguousarray(system.matrix[3 * i : 3 * i + 3]) for i in range(k)]
-    own = system.matrix.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
-    blocks = own[:, *np.triu_indices(3)].tolist()  # nn, n1, n2, 11, 12, 22
-    biases, coefficients = bias.tolist(), friction.tolist()
-    impulses = _admissible(start, friction)
-    flat = impulses.reshape(-1)
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        largest_change = 0.0
-        for i in range(k):
-            a_nn, a_n1, a_n2, a_11, a_12, a_22 = blocks[i]
-            w_n, w_1, w_2 = rows[i].dot(flat).tolist()
-            b_n, b_1, b_2 = biases[i]
-            at = 3 * i
-            old_n, old_1, old_2 = flat[at : at + 3].tolist()
-            new_n = max(old_n - (w_n + b_n) / a_nn, 0.0)
-            if new_n == 0.0 == old_n:
-                continue
-            change_n = new_n - old_n
-            # Slip without the tangential impulses of this contact.
-            c_1 = w_1 + b_1 + a_n1 * change_n - a_11 * old_1 - a_12 * old_2
-            c_2 = w_2 + b_2 + a_n2 * change_n - a_12 * old_1 - a_22 * old_2
-            new_1, new_2 = _friction(a_11, a_12, a_22, c_1, c_2, coefficients[i] * new_n)
-            flat[at], flat[at + 1], flat[at + 2] = new_n, new_1, new_2
-            largest_change = max(
-                largest_change, a_nn * abs(change_n), a_11 * abs(new_1 - old_1), a_22 * abs(new_2 - old_2)
-            )
-        if largest_change <= tolerance:
-            return Solution(impulses, iteration, True)
-    return Solution(impulses, MAX_ITERATIONS, False)
+    return _sweep(system, bias, np.zeros(len(free)), friction, _admissible(start, friction), tolerance)
 
 
 def solve_positions(
-    system: ContactSystem, wanted: Array, *, two_sided: NDArray[np.bool_], tolerance: float
+    system: ContactSystem, wanted: Array, *, two_sided: NDArray[np.bool_], tolerance: Array
 ) -> Solution:
     """Normal impulses of a motion that moves bodies apart and leaves their velocities alone.
 
@@ -133,48 +124,66 @@ def solve_positions(
         system: of the contacts.
         wanted: normal velocities of that motion [m/s], (k,): at least so much, or just so much.
         two_sided: contacts that get just that, (k,).
-        tolerance: largest change of a contact velocity in the last sweep [m/s].
+        tolerance: largest change of a contact velocity in the last sweep of each island [m/s], (islands,).
     """
     k = len(wanted)
-    matrix = np.ascontiguousarray(system.matrix[::3, ::3])
-    diagonal, targets = np.diagonal(matrix).tolist(), wanted.tolist()
-    lowest = np.where(two_sided, -np.inf, 0.0).tolist()
-    impulses = np.zeros((k, 3))
-    normal = np.zeros(k)
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        largest_change = 0.0
-        for i in range(k):
-            old = float(normal[i])
-            new = max(old + (targets[i] - float(matrix[i].dot(normal))) / diagonal[i], lowest[i])
-            normal[i] = new
-            largest_change = max(largest_change, diagonal[i] * abs(new - old))
-        impulses[:, 0] = normal
-        if largest_change <= tolerance:
-            return Solution(impulses, iteration, True)
-    return Solution(impulses, MAX_ITERATIONS, False)
+    bias = np.zeros((k, 3))
+    bias[:, 0] = -wanted
+    return _sweep(system, bias, np.where(two_sided, -LARGEST_IMPULSE, 0.0), np.zeros(k), np.zeros((k, 3)), tolerance)
 
 
-def _friction(a_11: float, a_12: float, a_22: float, c_1: float, c_2: float, limit: float) -> tuple[float, float]:
-    """Tangential impulses x with slip w = A x + c: w = 0, or |x| = limit and w = -κ x with κ > 0.
+def tangent_basis(normal: Array) -> Array:
+    """Two unit tangents a normal, (k, 2, 3), that depend on it continuously but at one pole (Duff et al. 2017)."""
+    x, y, z = normal.T
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    tangents = np.empty((len(normal), 2, 3))
+    tangents[:, 0, 0], tangents[:, 0, 1], tangents[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    tangents[:, 1, 0], tangents[:, 1, 1], tangents[:, 1, 2] = b, sign + y * y * a, -y
+    return tangents
 
-    The second solves (A + κ) x = -c; Newton's method on 1/limit = 1/|x(κ)|, which is nearly linear in κ, approaches
-    its root from below (Conn, Gould & Toint 2000, "Trust-region methods", 7.3).
-    """
-    if limit <= 0.0:
-        return 0.0, 0.0
-    kappa = 0.0
-    for _ in range(MAX_FRICTION_STEPS):
-        d_11, d_22 = a_11 + kappa, a_22 + kappa
-        determinant = d_11 * d_22 - a_12 * a_12
-        x_1, x_2 = (a_12 * c_2 - d_22 * c_1) / determinant, (a_12 * c_1 - d_11 * c_2) / determinant
-        square = x_1 * x_1 + x_2 * x_2
-        if square <= limit * limit * FRICTION_ROUNDING:
-            return x_1, x_2
-        # -x·dx/dκ = x·(A + κ)⁻¹x
-        fall = (d_22 * x_1 * x_1 - 2.0 * a_12 * x_1 * x_2 + d_11 * x_2 * x_2) / determinant
-        kappa += (square**0.5 / limit - 1.0) * square / fall
-    scale = limit / square**0.5
-    return scale * x_1, scale * x_2
+
+def _sweep(
+    system: ContactSystem, bias: Array, lowest: Array, friction: Array, impulses: Array, tolerance: Array
+) -> Solution:
+    """Impulses from those given on, which are overwritten."""
+    from sim.rigid.contact_kernels import System, sweep_islands
+
+    k = len(bias)
+    order = np.argsort(system.islands, kind="stable").astype(np.int32)
+    first = np.concatenate([[0], np.cumsum(np.bincount(system.islands))]).astype(np.int32)
+    change, sweeps = np.zeros((system.body_count, 6)), np.zeros(len(first) - 1, dtype=np.int32)
+    sweep_islands(
+        order,
+        first,
+        System(
+            system.movers,
+            system.jacobian.reshape(k, 36),
+            system.response.reshape(k, 36),
+            system.own,
+            bias,
+            lowest,
+            friction,
+        ),
+        tolerance,
+        MAX_ITERATIONS,
+        impulses,
+        change,
+        np.empty((k, 6)),
+        sweeps,
+    )
+    most = int(sweeps.max())
+    return Solution(impulses, change, min(most, MAX_ITERATIONS), most <= MAX_ITERATIONS)
+
+
+def _islands(movers: NDArray[np.int32], n: int) -> Indices:
+    """Numbers of the groups of contacts, (k,), that bodies which impulses move link."""
+    linking = (movers >= 0).all(axis=1)
+    first, second = movers[linking].T
+    links = coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(n, n))
+    group = connected_components(links, directed=False)[1]
+    return np.unique(group[movers.max(axis=1)], return_inverse=True)[1].astype(np.int64)
 
 
 def _admissible(impulses: Array, friction: Array) -> Array:

@@ -13,15 +13,14 @@ from sim.core.motion.paths import Poses
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-Key = tuple[int, int, int]  # of a contact from step to step: the two bodies, and which ball of which of them
-FEATURE_BITS = 32
+BODY_BITS, FEATURE_BITS, WALL_BITS = 19, 24, 3
+"""Of a contact's key: the first body, the second, which of the two the ball belongs to (one bit), and which it is.
+
+The highest bits of a feature are the number of the wall that the ball meets."""
 
 SAME_PATCH = 0.9  # normals closer than this cosine (26°) belong to one patch of contact
 MOST_PATCHES = 4  # patches of one pair that are kept, deepest first: more normals than three hold a body in any pose
 KEPT_BONUS = 2.0e-3  # head start, in extents of the patch, of points of the last step: equal ones must not take turns
-_ANGLES = 2.0 * np.pi * (np.arange(8) + 0.29) / 8.0
-_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
-"""Eight directions find every corner of a convex patch with an angle under 135°; the offset avoids symmetry axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +29,7 @@ class Contacts:
 
     first: Indices  # numbers of the two bodies, (k,)
     second: Indices
-    keys: Indices  # what tells them apart from step to step, (k, 3) int64
+    keys: Indices  # what tells them apart from step to step, (k,)
     point: Array  # [m], (k, 3)
     normal: Array  # from the second to the first, (k, 3)
     gap: Array  # [m], (k,), negative where they overlap
@@ -72,76 +71,51 @@ class AnchoredContacts:
         """Some of them."""
         return AnchoredContacts(*(getattr(self, field.name)[rows] for field in fields(self)))
 
+    @property
+    def first(self) -> Indices:
+        """The first bodies of the pairs, (k,)."""
+        return np.where(self.side == 0, self.owner, self.other)
+
+    @property
+    def second(self) -> Indices:
+        """The second bodies, (k,)."""
+        return np.where(self.side == 0, self.other, self.owner)
+
     def keys(self) -> Indices:
-        """Bodies, first and second, and feature with the side in its high bits, (k, 3)."""
-        first = np.where(self.side == 0, self.owner, self.other)
-        second = np.where(self.side == 0, self.other, self.owner)
-        return np.stack([first, second, self.feature + (self.side << FEATURE_BITS)], axis=1)
+        """Number that tells a contact apart from step to step, (k,), in the order of the pairs."""
+        pair = pair_keys(self.first, self.second)
+        return (pair << (FEATURE_BITS + 1)) | (self.side << FEATURE_BITS) | self.feature
 
     def at(self, poses: Poses) -> Contacts:
         """The contacts where the bodies are now."""
         if not len(self):
-            return Contacts(self.owner, self.other, self.keys(), self.centre, self.centre, self.radius)
+            return Contacts(self.owner, self.other, self.owner, self.centre, self.centre, self.radius)
         turned = poses.rotation[self.other]
         outward = np.einsum("kij,kj->ki", turned, self.outward)
         anchor = poses.position[self.other] + np.einsum("kij,kj->ki", turned, self.anchor)
         centre = poses.position[self.owner] + np.einsum("kij,kj->ki", poses.rotation[self.owner], self.centre)
         height = np.einsum("ki,ki->k", outward, centre - anchor)
-        keys = self.keys()
         return Contacts(
-            first=keys[:, 0],
-            second=keys[:, 1],
-            keys=keys,
+            first=self.first,
+            second=self.second,
+            keys=self.keys(),
             point=centre - self.radius[:, None] * outward,
             normal=np.where(self.side == 0, 1.0, -1.0)[:, None] * outward,
             gap=height - self.radius,
         )
 
 
-def tangent_basis(normal: Array) -> Array:
-    """Two unit tangents a normal, (k, 2, 3), that depend on it continuously but at one pole (Duff et al. 2017)."""
-    x, y, z = normal.T
-    sign = np.where(z < 0.0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    tangents = np.empty((len(normal), 2, 3))
-    tangents[:, 0, 0], tangents[:, 0, 1], tangents[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    tangents[:, 1, 0], tangents[:, 1, 1], tangents[:, 1, 2] = b, sign + y * y * a, -y
-    return tangents
+def pair_keys(first: Indices, second: Indices) -> Indices:
+    """Number of a pair of bodies, (k,), in the order of the first, then of the second."""
+    return (first << BODY_BITS) | second
 
 
-def reduce_manifold(contacts: Contacts, last: frozenset[Key], *, margin: float) -> Indices:
-    """Rows of the contacts of a pair, one at least, to keep: by patches of like normals, deepest first; then ascending.
-
-    Those of the last step, by their keys, are preferred among equals; gaps up to a margin were looked for [m].
-    """
-    kept = []
-    remaining = np.arange(len(contacts))
-    for _ in range(MOST_PATCHES):
-        deepest = remaining[np.argmin(contacts.gap[remaining])]
-        normal = contacts.normal[deepest]
-        alike = contacts.normal[remaining] @ normal >= SAME_PATCH
-        kept.append(_corners(contacts, remaining[alike], deepest, normal, last, margin))
-        remaining = remaining[~alike]
-        if not len(remaining):
-            break
-    return np.concatenate(kept)
+def bodies_of(keys: Indices) -> tuple[Indices, Indices]:
+    """The first and the second bodies of contacts, by their keys, (k,) each."""
+    return keys >> (FEATURE_BITS + 1 + BODY_BITS), (keys >> (FEATURE_BITS + 1)) & ((1 << BODY_BITS) - 1)
 
 
-def _corners(
-    contacts: Contacts, patch: Indices, deepest: np.int64, normal: Array, last: frozenset[Key], margin: float
-) -> Indices:
-    """The deepest point of a patch, and those that meet first when it is tilted in eight directions.
-
-    The tilt is a margin across the patch: of a flat face the corners are kept, of a bumpy or a round one the bumps
-    that it stands on. The outermost points alone, which may hang above, would let it sink from bump to bump.
-    """
-    if len(patch) <= 2:
-        return patch
-    along = (contacts.point[patch] @ tangent_basis(normal[None])[0].T) @ _DIRECTIONS
-    extent = np.ptp(along, axis=0).max()
-    if last:
-        kept = np.array([tuple(key) in last for key in contacts.keys[patch].tolist()])
-        along = along + (KEPT_BONUS * extent) * kept[:, None]
-    reach = margin * along - extent * contacts.gap[patch, None]
-    return np.unique(np.append(patch[np.argmax(reach, axis=0)], deepest))
+def rows_of(keys: Indices, known: Indices) -> tuple[Indices, NDArray[np.bool_]]:
+    """Where keys stand among known ones, which ascend and are some, and whether they do, (k,) each."""
+    rows = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+    return rows, known[rows] == keys

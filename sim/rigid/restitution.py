@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
-from sim.rigid.contacts import Array, Contacts
+from sim.rigid.contacts import Array, Contacts, Indices
 from sim.rigid.states import MovingBodies
 
 SLOWEST_BOUNCE = 0.02  # approach below which nothing bounces [m/s]; or two steps of gravity
@@ -64,6 +63,21 @@ class Bounces:
             fall=acceleration * rest,
         )
 
+    @classmethod
+    def none(cls, count: int) -> Bounces:
+        """No impacts, at so many contacts."""
+        no, zero = np.zeros(count, dtype=bool), np.zeros(count)
+        return cls(no, no, zero, zero, zero, zero)
+
+    def then(self, later: Bounces) -> Bounces:
+        """These impacts, but the later ones at contacts that have one."""
+        pairs = ((getattr(self, field.name), getattr(later, field.name)) for field in fields(self))
+        return Bounces(*(np.where(later.happens, after, before) for before, after in pairs))
+
+    def chosen(self, rows: Indices) -> Bounces:
+        """Those at some of the contacts."""
+        return Bounces(*(getattr(self, field.name)[rows] for field in fields(self)))
+
     def least_velocity(self, otherwise: Array, *, share: float) -> Array:
         """Least normal velocities at the end of the step [m/s], (k,), `otherwise` where contacts do not bounce.
 
@@ -83,8 +97,7 @@ def solve_impacts(
     bounces: Bounces,
     least_normal: Array,
     friction: Array,
-    start: Array,
-    tolerance: float,
+    tolerance: Array,
 ) -> Solution:
     """Impulses with Newton's restitution, as far as energy allows; arguments as those of `solve_velocities`.
 
@@ -102,20 +115,20 @@ def solve_impacts(
     group of bodies that touch has its own s.
     """
     solve = partial(solve_velocities, system, free, friction=friction, tolerance=tolerance)
-    compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=start)
-    if not bounces.happens.any():
-        return compression
+    nothing = np.zeros_like(free)
+    compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=nothing)
     before = compression.impulses
     newton = solve(
         least_normal=bounces.least_velocity(least_normal, share=1.0),
         start=(1.0 + bounces.restitution)[:, None] * before,
     )
-    islands = _islands(system)
+    islands = system.islands
     step = newton.impulses - before
     fall = np.stack([bounces.fall, np.zeros_like(bounces.fall), np.zeros_like(bounces.fall)], axis=1)
     # Mean velocity while an impulse acts, at the instant of the impact.
-    mean_before = free + 0.5 * system.velocity_changes(before) - fall
-    change = system.velocity_changes(step)
+    mean_before = free + 0.5 * system.velocities(compression.change) - fall
+    change_of_bodies = newton.change - compression.change
+    change = system.velocities(change_of_bodies)
     work_before, linear, quadratic = (
         np.bincount(islands, weights=terms)
         for terms in (
@@ -127,18 +140,17 @@ def solve_impacts(
     returned = -np.bincount(islands, weights=bounces.restitution**2 * before[:, 0] * mean_before[:, 0])
     most = np.maximum(np.minimum(work_before + returned, 0.0), work_before)
     share = np.array([_largest_share(*each) for each in zip(most - work_before, linear, quadratic, strict=True)])
+    # Of bodies that no impulse moves nothing changes, whatever their share.
+    share_of_bodies = np.zeros(system.body_count)
+    for side in range(2):
+        moves = system.movers[:, side] >= 0
+        share_of_bodies[system.movers[moves, side]] = share[islands[moves]]
     return Solution(
         before + share[islands][:, None] * step,
+        compression.change + share_of_bodies[:, None] * change_of_bodies,
         compression.iterations + newton.iterations,
         compression.converged and newton.converged,
     )
-
-
-def _islands(system: ContactSystem) -> NDArray[np.int64]:
-    """Numbers of the groups of contacts, (k,): impulses at one change velocities at others of its group only."""
-    k = len(system.axes)
-    is_linked = system.matrix.reshape(k, 3, k, 3).any(axis=(1, 3))
-    return connected_components(is_linked, directed=False)[1].astype(np.int64)
 
 
 def _largest_share(room: float, linear: float, quadratic: float) -> float:

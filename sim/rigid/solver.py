@@ -21,17 +21,17 @@ from sim.rigid.contact_response import ContactResponse, Surfaces
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies, rotate_freely
+from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
 from sim.shapes.body_geometry import BodyGeometry
 
 LARGEST_DT = 2.0e-3
 """Largest step [s] of dynamic bodies, which holds a stack of boxes to a micrometre, and of bodies with keyframes, as
 nothing else looks ahead to where a path sets in."""
 
-LARGEST_ADVANCE = 0.25
-"""How far surfaces may get in a step, in half shortest edges of the smallest dynamic body; a body that nothing is near
-may get half of the way to what is nearest."""
+SLEEP_SHARE, SLEEP_TIME_S = 0.1, 0.5
+"""A group of bodies that touch sleeps when all of them were slower for such a time [s] than a share of the speed that
+gravity gives in the largest step: 2 mm/s on Earth, by which they get 1 mm in that time."""
 
-LARGEST_TURN = 0.1  # how far bodies may turn in a step [rad]: rotation errs by about a tenth of its square
 LOST_DISTANCE = 10.0  # a dynamic body farther from the domain's centre, in diagonals, is stopped: it fell out of sight
 
 SOLVER_NAME = "rigid"
@@ -42,7 +42,9 @@ RUNAWAY_SPEED = 1.0e4  # no rigid body of a film moves at thirty times the speed
 class RigidSolver:
     """All dynamic and kinematic bodies of a scene; static bodies and the domain's closed faces are obstacles.
 
-    State in float64 on the host. One substep: gravity, contact impulses from the poses at its start, then the poses.
+    State in float64 on the host; contacts are found and solved in kernels, for which `sim.core.runtime.initialize` must
+    have run. One substep: gravity, contact impulses from the poses at its start, then the poses. Groups of bodies that
+    are too fast for it take several steps of their own, and groups that rest sleep (`steps`).
     Free flight is exact for constant gravity, and angular momentum is kept to round-off (`rotate_freely`). Impulses of
     contacts are equal and opposite at one point, so that contacts change neither the linear nor the angular momentum
     of bodies that nothing else holds.
@@ -61,6 +63,7 @@ class RigidSolver:
         surfaces: friction and restitution of all of these.
         walls: closed faces of the domain.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
+        has_own_steps: whether fast bodies divide the step of all; nothing that is coupled to them shares it then.
 
     Raises:
         ShapeError: a shape cannot be built.
@@ -89,20 +92,18 @@ class RigidSolver:
         self.all_names = tuple(body.name for body in everybody)
         self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
-        can_move = np.concatenate([self.bodies.is_dynamic, np.zeros(len(fixed), dtype=bool)])
-        self._detector = CollisionDetector(self.all_geometries, can_move, self.walls)
+        self._detector = CollisionDetector(self.all_geometries, self.walls)
         self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
         )
         self._response = ContactResponse(self.surfaces, self.gravity)
         corners = np.array([domain.min, domain.max])
+        self._chooser = StepChooser(self.all_geometries, self.bodies, self.walls, self._detector, self.gravity)
+        self.has_own_steps = False
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
         self._radius = np.array([geometry.radius for geometry in self.solids])
-        dynamic = np.flatnonzero(self.bodies.is_dynamic)
-        smallest = min((self.solids[number].shortest_edge for number in dynamic), default=math.inf)
-        self._largest_advance = LARGEST_ADVANCE * 0.5 * smallest
         self._largest_dt = largest_dt(parameters)
         self.time_s = 0.0
         self.begin_frame(0.0)
@@ -121,33 +122,47 @@ class RigidSolver:
     def stable_dt(self) -> float:
         """Largest step [s] in which bodies turn little, and those that may meet something move little.
 
-        Gravity's part counts.
+        Gravity's part counts. Where fast bodies have steps of their own it is that of a stack; none, 0, where the state
+        is bad.
         """
+        if self.first_bad_quantity() is not None:
+            return 0.0
         spin = float(np.max(np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1)), initial=0.0))
-        dt = self._largest_dt if spin == 0.0 else min(self._largest_dt, LARGEST_TURN / spin)
-        if not math.isfinite(self._largest_advance):
+        is_dynamic = self.bodies.is_dynamic
+        own_steps = MOST_OWN_STEPS if self.has_own_steps and is_dynamic.any() else 1
+        dt = self._largest_dt if spin == 0.0 else min(self._largest_dt, own_steps * LARGEST_TURN / spin)
+        if not is_dynamic.any() or self._chooser.needs_none(dt / own_steps):
             return dt
-        speeds, acceleration = self._surface_speeds(), float(np.linalg.norm(self.gravity))
-        for number in np.argsort(-speeds):
-            if time_of(self._largest_advance, speeds[number], acceleration) >= dt:
-                break  # of slower ones, too
-            dt = min(dt, self._time_to_get_near(number, speeds, acceleration))
-        return dt
+        meetings = self._chooser.meetings(self.poses(), dt, ~self.bodies.is_asleep)
+        shortest = min(float(np.min(each, initial=np.inf)) for each in (meetings.time_s, meetings.alone_s))
+        return min(dt, own_steps * shortest)
 
     def substep(self, dt: float) -> None:
-        """Advance by dt [s]."""
+        """Advance by dt [s]; groups of bodies that are too fast for it by several steps of their own."""
+        bodies, start_s = self.bodies, self.time_s
+        if bodies.is_dynamic.any() and self.first_bad_quantity() is None:
+            awake = self._awake(dt)
+            for count, is_active in self._chooser.divided(self.poses(), dt, awake):
+                self._place_kinematic_bodies(start_s)
+                for step in range(count):
+                    self._advance(dt / count, start_s + step * (dt / count), is_active)
+            self._put_to_sleep(dt)
+        self.time_s = start_s + dt
+        self._place_kinematic_bodies(self.time_s)
+        self._stop_lost_bodies()
+
+    def _advance(self, dt: float, time_s: float, is_active: NDArray[np.bool_]) -> None:
+        """Advance free bodies, (n,), by dt [s], and kinematic ones from a time [s] on."""
         bodies = self.bodies
-        if not bodies.is_dynamic.any():  # nothing that impulses, contacts or weight could move
-            self.time_s += dt
-            self._place_kinematic_bodies(self.time_s)
-            return
         before = (bodies.position.copy(), bodies.orientation.copy())
-        free = bodies.is_free[:, None]
+        free = is_active[:, None]
         bodies.velocity = bodies.velocity + np.where(free, dt * self.gravity, 0.0)
-        self._set_mean_velocities_of_kinematic_bodies(dt)
-        reach = self._with_obstacles(dt * self._surface_speeds())
-        contacts = self._detector.find(self.poses(), reach, self._response.last_keys)
-        outcome = self._response.resolve(contacts, bodies, dt)
+        self._set_mean_velocities_of_kinematic_bodies(time_s, dt)
+        moves = is_active | ~bodies.is_dynamic
+        reach = self._with_obstacles(np.where(moves, dt * self._surface_speeds(), 0.0))
+        among = np.append(is_active, np.zeros(len(self._fixed_position) - 1, dtype=bool))
+        contacts = self._detector.find(self.poses(), reach, self._response.last_keys, among)
+        outcome = self._response.resolve(contacts, bodies, dt, is_active)
         self._contact_count = len(contacts)
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
@@ -156,7 +171,7 @@ class RigidSolver:
         # A body in free flight moves by the mean of its velocities, which is exact; one in contact by the new one,
         # which is what the contacts allow, and so does one that a fluid pushed: the fluid is to see how it moves.
         flying = free & ~(outcome.is_touched | bodies.is_pushed)[:, None]
-        bodies.is_pushed[:] = False
+        bodies.is_pushed = bodies.is_pushed & ~is_active
         velocity = bodies.velocity - np.where(flying, 0.5 * dt * self.gravity, 0.0)
         bodies.position = bodies.position + dt * np.where(free, velocity + outcome.extra_velocity, 0.0)
         spin = bodies.angular_momentum()
@@ -167,17 +182,49 @@ class RigidSolver:
             # Bodies that are alone keep their spin. Beside what cannot move, which takes any, it turns with the body:
             # that keeps the energy.
             spin = np.where(outcome.is_held[:, None], rotation.rotated(turn, spin), spin)
-        bodies.set_angular_momentum(spin)
-        rotate_freely(bodies, dt)
-        self.time_s += dt
-        self._place_kinematic_bodies(self.time_s)
+        bodies.set_angular_momentum(spin, is_active)
+        rotate_freely(bodies, dt, is_active)
+        self._place_kinematic_bodies(time_s + dt)
         self._detector.follow(self._with_obstacles(self._surface_motion_since(*before)))
-        self._stop_lost_bodies()
+
+    def _awake(self, dt: float) -> NDArray[np.bool_]:
+        """Bodies that do not sleep, (n,), after those were woken that what moves may meet in dt [s], and so on."""
+        bodies = self.bodies
+        while bodies.is_asleep.any():
+            moves = np.where(bodies.is_dynamic, bodies.is_free & ~bodies.is_asleep, self._surface_speeds() > 0.0)
+            if not moves.any():
+                break
+            meetings = self._chooser.meetings(self.poses(), dt, moves)
+            met = np.zeros(len(self.all_geometries), dtype=bool)
+            met[meetings.first] = met[meetings.second] = True
+            woken = met[: len(bodies)] & bodies.is_asleep
+            if not woken.any():
+                break
+            bodies.wake(woken)
+        return ~bodies.is_asleep
+
+    def _put_to_sleep(self, dt: float) -> None:
+        """Let groups sleep that have rested long enough, beside nothing that is led; without gravity nothing rests."""
+        bodies, n, speeds = self.bodies, len(self.bodies), self._surface_speeds()
+        awake = bodies.is_free & ~bodies.is_asleep
+        slow = speeds <= SLEEP_SHARE * LARGEST_DT * float(np.linalg.norm(self.gravity))
+        bodies.rest_s = np.where(awake & slow, bodies.rest_s + dt, 0.0)
+        rests = awake & (bodies.rest_s >= SLEEP_TIME_S)
+        if not rests.any() or not self.gravity.any():
+            return
+        first, second = (np.minimum(numbers, n) for numbers in self._detector.near())
+        free, leads = np.append(awake, False), np.append(~bodies.is_dynamic & (speeds > 0.0), False)
+        links = free[first] & free[second]
+        groups = groups_of(first[links], second[links], n)
+        restless = np.zeros(n, dtype=bool)
+        np.logical_or.at(restless, groups, awake & ~rests)
+        for one, two in ((first, second), (second, first)):
+            restless[groups[one[free[one] & leads[two]]]] = True
+        bodies.put_to_sleep(rests & ~restless[groups])
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
         self.time_s = time_s
-        self._detector.forget()  # so that a run that continues here does the same
         self._contact_count = self._iterations = self._not_converged = 0
         self._max_penetration = 0.0
 
@@ -202,6 +249,7 @@ class RigidSolver:
         if not 0.0 < factor < math.inf:
             raise ValueError(f'the mass of "{name}" can only be scaled by a finite number above 0, got {factor:g}')
         self.bodies.scale_mass(number, factor)
+        self._wake_all()
 
     def set_surface(self, name: str, *, friction: float | None = None, restitution: float | None = None) -> None:
         """Change how a body rubs and rebounds [-] between frames, static ones included; no checkpoint knows of it.
@@ -220,10 +268,15 @@ class RigidSolver:
             self.surfaces.friction[number] = friction
         if restitution is not None:
             self.surfaces.restitution[number] = restitution
+        self._wake_all()
 
     def set_gravity(self, gravity: Vector3) -> None:
         """Change gravity [m/s²] between frames, for contacts as well; no checkpoint knows of it."""
         self.gravity[:] = gravity
+        self._wake_all()
+
+    def _wake_all(self) -> None:
+        self.bodies.wake(np.ones(len(self.bodies), dtype=bool))
 
     def _with_obstacles(self, motion: Array) -> Array:
         """Motion of the moving bodies, and none of all others."""
@@ -235,35 +288,8 @@ class RigidSolver:
         turned = np.sqrt(np.square(self.bodies.orientation - orientation).sum(axis=1))
         return moved + 2.0 * turned * self._radius
 
-    def _time_to_get_near(self, number: int, speeds: Array, acceleration: float) -> float:
-        """Time [s] in which a body that moves, and each thing that it may meet, get as far as a step may take them.
-
-        Spheres around bodies are looked at; the sum of both advances goes by the speed of one against the other.
-        """
-        bodies, speed = self.bodies, max(float(speeds[number]), 1.0e-30)
-        centre, others = bodies.position[number], np.arange(len(speeds)) != number
-        spins = speeds - np.sqrt(np.square(bodies.velocity).sum(axis=1))
-        relative = np.sqrt(np.square(bodies.velocity - bodies.velocity[number]).sum(axis=1)) + spins + spins[number]
-        room = np.sqrt(np.square(bodies.position - centre).sum(axis=1)) - self._radius
-        of_obstacles = [wall.distance(centre, centre) for wall in self.walls]
-        fixed = self.all_geometries[len(speeds) :]
-        # The domain comes after the obstacles.
-        for geometry, position, turn in zip(fixed, self._fixed_position, self._fixed_rotation, strict=False):
-            away = centre - position
-            if geometry.is_analytic:
-                of_obstacles.append(float(geometry.signed_distance((away @ turn)[None])[0]))
-            else:
-                of_obstacles.append(float(np.linalg.norm(away)) - geometry.radius)
-        still = np.ones(len(of_obstacles))
-        room = np.concatenate([room[others], of_obstacles]) - self._radius[number]
-        relative = np.concatenate([relative[others], speed * still])
-        both = np.concatenate([1.0 + np.minimum(1.0, speeds[others] / speed), still])
-        advance = np.maximum(both * self._largest_advance, 0.5 * room)
-        return float(np.min(time_of(advance, relative, acceleration), initial=np.inf))
-
     def _surface_speeds(self) -> Array:
-        spin = np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1))
-        return np.sqrt(np.square(self.bodies.velocity).sum(axis=1)) + spin * self._radius
+        return self.bodies.surface_speeds(self._radius)
 
     def _place_kinematic_bodies(self, time_s: float) -> None:
         for number, path in self.paths.items():
@@ -274,10 +300,10 @@ class RigidSolver:
             self.bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
             self.bodies.angular_velocity[number] = motion.angular_velocity
 
-    def _set_mean_velocities_of_kinematic_bodies(self, dt: float) -> None:
-        """Contacts see how kinematic bodies will have moved by the end of the step."""
+    def _set_mean_velocities_of_kinematic_bodies(self, time_s: float, dt: float) -> None:
+        """Contacts see how kinematic bodies will have moved by the end of the step of dt [s] from a time [s] on."""
         for number, path in self.paths.items():
-            end = path.at(self.time_s + dt)
+            end = path.at(time_s + dt)
             arm = rotation.rotated(end.orientation, self.solids[number].centre_of_mass)
             self.bodies.velocity[number] = (end.position + arm - self.bodies.position[number]) / dt
             turn = rotation.product(end.orientation, rotation.conjugate(self.bodies.orientation[number]))
@@ -325,9 +351,10 @@ class RigidSolver:
         self.bodies.apply_impulses(linear, np.zeros_like(linear))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """Poses, velocities, the clock, and the impulses that the next contacts start from."""
+        """Poses, velocities, sleep, the clock, the contacts, and the forces that the next ones start from."""
         return {
             **{name: getattr(self.bodies, name).copy() for name in _STATE},
+            **self._detector.checkpoint(),
             **self._response.checkpoint(),
             "clock": np.array([self.time_s]),
         }
@@ -339,6 +366,7 @@ class RigidSolver:
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}, got {found}")
+        self._detector.restore(arrays)
         self._response.restore(arrays)
         for name in _STATE:
             setattr(self.bodies, name, np.array(arrays[name], dtype=getattr(self.bodies, name).dtype))
@@ -348,8 +376,8 @@ class RigidSolver:
         """Totals over the dynamic bodies that are not lost, and the contacts of the frame.
 
         `angular_momentum_*` [kg m²/s] is about the world's origin, `potential_energy` [J] is zero there; `contacts`
-        is their number in the last substep, `max_penetration` [m] the worst of the frame, `iterations` their sum over
-        the frame, `bodies_lost` the number of bodies stopped far outside of the domain.
+        is their number in the last substep, of bodies that do not sleep, `max_penetration` [m] the worst of the frame,
+        `iterations` their sum over the frame, `bodies_lost` the number of bodies stopped far outside of the domain.
         """
         bodies, free = self.bodies, self.bodies.is_free
         mass = bodies.mass[free]
@@ -392,18 +420,12 @@ class RigidSolver:
         return None
 
 
-def time_of(advance: Array | float, speed: Array | float, acceleration: float) -> Array:
-    """Time [s] in which v dt + g dt² is an advance [m], for speeds [m/s] and an acceleration [m/s²]."""
-    root = speed + np.sqrt(np.square(speed) + 4.0 * acceleration * np.asarray(advance))
-    return 2.0 * advance / np.maximum(root, 1.0e-300)
-
-
 def largest_dt(parameters: Sequence[RigidBodyParameters]) -> float:
     """Largest step [s] of these bodies, however slow they are."""
     return LARGEST_DT if any(body.kind == "dynamic" or body.keyframe for body in parameters) else math.inf
 
 
-_STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost")
+_STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost", "is_asleep", "rest_s")
 
 
 def _by_axis(name: str, vector: Array) -> dict[str, float]:

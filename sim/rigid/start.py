@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sim.rigid.broad_phase import overlapping_pairs
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.solver import RigidSolver
 
@@ -32,27 +34,31 @@ def start_problems(solver: RigidSolver) -> list[StartProblem]:
 
 def _overlaps(solver: RigidSolver) -> list[StartProblem]:
     """Pairs of bodies of which one is dynamic, with the exact distance of the balls found to overlap."""
-    poses = solver.poses()
-    is_dynamic = np.zeros(len(solver.all_geometries), dtype=bool)
-    is_dynamic[: len(solver.bodies)] = solver.bodies.is_dynamic
-    detector = CollisionDetector(solver.all_geometries, is_dynamic, ())
-    detector.find(poses, np.zeros(len(poses.position)), frozenset())
-    deepest: dict[tuple[int, int], float] = {}
-    found = detector.followed
-    for row, (first, second, _) in enumerate(found.keys().tolist()):
-        owner, other = int(found.owner[row]), int(found.other[row])
-        centre = poses.position[owner] + poses.rotation[owner] @ found.centre[row]
-        in_other = (centre - poses.position[other]) @ poses.rotation[other]
-        depth = float(found.radius[row] - solver.all_geometries[other].signed_distance(in_other[None])[0])
-        deepest[first, second] = max(depth, deepest.get((first, second), 0.0))
+    poses, geometries = solver.poses(), solver.all_geometries
+    is_dynamic = np.append(solver.bodies.is_dynamic, np.zeros(len(geometries) - len(solver.bodies), dtype=bool))
+    pairs = overlapping_pairs(*CollisionDetector(geometries, ()).boxes(poses), is_dynamic)
+    deepest: dict[tuple[int, int], tuple[float, NDArray[np.float64]]] = {}
+    for first, second in zip(*(numbers.tolist() for numbers in pairs), strict=True):
+        for owner, other in ((first, second), (second, first)):
+            balls = geometries[owner].balls
+            centres = poses.position[owner] + balls.centres.T @ poses.rotation[owner].T
+            in_other = (centres - poses.position[other]) @ poses.rotation[other]
+            low, high = geometries[other].bounds
+            near = np.all((in_other > low - balls.radii[:, None]) & (in_other < high + balls.radii[:, None]), axis=1)
+            if not near.any():
+                continue
+            depths = balls.radii[near] - geometries[other].signed_distance(in_other[near])
+            most = int(np.argmax(depths))
+            if (first, second) not in deepest or depths[most] > deepest[first, second][0]:
+                deepest[first, second] = float(depths[most]), centres[near][most]
     problems = []
-    for (first, second), depth in deepest.items():
+    for (first, second), (depth, place) in deepest.items():
         smaller = min(solver.all_geometries[number].shortest_edge for number in (first, second))
         if depth > START_OVERLAP * smaller:
             names = solver.all_names[first], solver.all_names[second]
             sentence = (
-                f'rigid bodies "{names[0]}" and "{names[1]}" start {depth:.3g} m deep in each other; '
-                "move them apart by that much"
+                f'rigid bodies "{names[0]}" and "{names[1]}" start {depth:.3g} m deep in each other; move them apart '
+                f"by that much: they are deepest at ({', '.join(f'{value:.3g}' for value in place)}) m"
             )
             problems.append(StartProblem(names[0], sentence))
     return problems

@@ -34,6 +34,8 @@ class MovingBodies:
         mass: [kg], (n,); infinite for bodies that no force moves.
         is_lost: (n,) bool: so far outside of the domain that it was stopped; no force moves it any more.
         is_pushed: (n,) bool: got an impulse since the last step; the step that takes it in resets it.
+        is_asleep: (n,) bool: rests, and is left alone until something that moves comes near, or an impulse wakes it.
+        rest_s: for how long it has been too slow to be seen to move [s], (n,).
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class MovingBodies:
         self.velocity, self.angular_velocity = velocity, angular_velocity
         self.is_dynamic = np.isfinite(self.mass)
         self.is_lost, self.is_pushed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        self.is_asleep, self.rest_s = np.zeros(n, dtype=bool), np.zeros(n)
         self._inverse_tensor = np.zeros((n, 3, 3))
         self._inverse_tensor[self.is_dynamic] = np.linalg.inv(self._tensor[self.is_dynamic])
         self.principal_moments, axes = np.linalg.eigh(self._tensor)
@@ -102,24 +105,43 @@ class MovingBodies:
         in_body = np.einsum("nji,nj->ni", turned, self.angular_velocity)
         return np.einsum("nij,nj->ni", turned, np.einsum("njk,nk->nj", self._tensor, in_body))
 
-    def set_angular_momentum(self, momentum: Array) -> None:
-        """Set the angular velocity of the free bodies to that of a spin in world axes [kg m²/s], (n, 3)."""
+    def surface_speeds(self, radius: Array) -> Array:
+        """Upper bounds of the speeds of surface points within a radius [m] of each body [m/s], (n,)."""
+        spin = np.sqrt(np.square(self.angular_velocity).sum(axis=1))
+        speeds: Array = np.sqrt(np.square(self.velocity).sum(axis=1)) + spin * radius
+        return speeds
+
+    def wake(self, which: NDArray[np.bool_]) -> None:
+        """Let bodies, (n,), move again."""
+        self.is_asleep = self.is_asleep & ~which
+        self.rest_s = np.where(which, 0.0, self.rest_s)
+
+    def put_to_sleep(self, which: NDArray[np.bool_]) -> None:
+        """Stop bodies, (n,), until they are woken."""
+        self.is_asleep = self.is_asleep | which
+        self.velocity = np.where(which[:, None], 0.0, self.velocity)
+        self.angular_velocity = np.where(which[:, None], 0.0, self.angular_velocity)
+
+    def set_angular_momentum(self, momentum: Array, which: NDArray[np.bool_]) -> None:
+        """Set the angular velocity of bodies, (n,), to that of a spin in world axes [kg m²/s], (n, 3)."""
         turned = self.rotation()
         in_body = np.einsum("nji,nj->ni", turned, momentum)
         angular_velocity = np.einsum("nij,nj->ni", turned, np.einsum("njk,nk->nj", self._inverse_tensor, in_body))
-        self.angular_velocity = np.where(self.is_free[:, None], angular_velocity, self.angular_velocity)
+        self.angular_velocity = np.where(which[:, None], angular_velocity, self.angular_velocity)
 
     def apply_impulses(self, linear: Array, angular: Array) -> None:
         """Change the velocities of the dynamic bodies by linear [N s] and angular impulses [N m s], (n, 3) each."""
         if not self.is_dynamic.any():
             return
-        self.is_pushed = self.is_pushed | linear.any(axis=1)
+        pushed = linear.any(axis=1)
+        self.is_pushed = self.is_pushed | pushed
+        self.wake(pushed | angular.any(axis=1))
         self.velocity = self.velocity + self.inverse_mass[:, None] * linear
         self.angular_velocity = self.angular_velocity + np.einsum("nij,nj->ni", self.inverse_inertia(), angular)
 
 
-def rotate_freely(bodies: MovingBodies, dt: float) -> None:
-    """Turn the free bodies by I domega/dt = -omega x (I omega) for dt [s].
+def rotate_freely(bodies: MovingBodies, dt: float, which: NDArray[np.bool_]) -> None:
+    """Turn bodies, (n,), by I domega/dt = -omega x (I omega) for dt [s].
 
     Strang splitting of the Euler equations into rotations about the principal axes (Dullweber, Leimkuhler & McLachlan
     1997, "Symplectic splitting methods for rigid body molecular dynamics"; McLachlan 1993). Every part is solved as a
@@ -138,8 +160,8 @@ def rotate_freely(bodies: MovingBodies, dt: float) -> None:
         j, k = (axis + 1) % 3, (axis + 2) % 3
         in_body[j], in_body[k] = cosine * in_body[j] + sine * in_body[k], cosine * in_body[k] - sine * in_body[j]
     q = rotation.normalized(rotation.product(q, rotation.conjugate(bodies.principal_orientation)))
-    bodies.orientation = np.where(bodies.is_free[:, None], q, bodies.orientation)
-    bodies.set_angular_momentum(spin)
+    bodies.orientation = np.where(which[:, None], q, bodies.orientation)
+    bodies.set_angular_momentum(spin, which)
 
 
 class StaticBody:

@@ -78,23 +78,10 @@ class BodyGeometry:
         """How far outside of the body contact distances hold [m]."""
         return np.inf if self.is_analytic else GRID_PADDING * float(np.max(self.bounds[1] - self.bounds[0]))
 
-    def contact_distance(self, points: Points) -> NDArray[np.float64]:
-        """Distance to its surface [m], negative inside, fast; up to `reach` outside."""
-        if self.is_analytic:
-            return self.signed_distance(points)
-        return self._grid.signed_distance(points + self.centre_of_mass)
-
-    def contact_normal(self, points: Points) -> Points:
-        """Unit gradient of the contact distance, (k, 3); away from the centre of mass where it has none."""
-        step = 1.0e-5 * self.shortest_edge if self.is_analytic else 0.5 * self._grid.spacing
-        offsets = step * np.concatenate([np.eye(3), -np.eye(3)])
-        values = self.contact_distance((points[:, None] + offsets).reshape(-1, 3)).reshape(-1, 6)
-        gradient = (values[:, :3] - values[:, 3:]) / (2.0 * step)
-        length = np.sqrt(np.square(gradient).sum(axis=1))
-        lost = length < 1.0e-3  # on a medial axis, such as the centre of a sphere
-        gradient[lost] = points[lost] + np.array([0.0, 0.0, 1.0e-9 * self.shortest_edge])
-        length[lost] = np.sqrt(np.square(gradient[lost]).sum(axis=1))
-        return gradient / length[:, None]
+    @property
+    def normal_step(self) -> float:
+        """Half width of the differences of distances that contact normals are made of [m]."""
+        return 1.0e-7 * self.shortest_edge if self.is_analytic else 0.5 * self.grid.spacing
 
     @cached_property
     def balls(self) -> Balls:
@@ -108,7 +95,8 @@ class BodyGeometry:
         return self.balls.exact and bool(np.all(self.balls.radii <= other.reach))
 
     @cached_property
-    def _grid(self) -> LevelSet:
+    def grid(self) -> LevelSet:
+        """Distances of a mesh as contacts read them, in the frame of `solid`."""
         longest = float(np.max(self.bounds[1] - self.bounds[0]))
         return LevelSet.sample(self.solid, longest / GRID_CELLS, padding=GRID_PADDING * longest)
 

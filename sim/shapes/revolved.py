@@ -38,7 +38,7 @@ class Revolved(RestShape):
         return bool(self.profile[0, 0] == 0.0)
 
     @cached_property
-    def _segments(self) -> tuple[Profile, Profile]:
+    def segments(self) -> tuple[Profile, Profile]:
         """Starts and ends of the segments that turn into surface, (m, 2) each; what lies on the axis does not."""
         if self._meets_axis:
             return self.profile[:-1], self.profile[1:]
@@ -47,7 +47,7 @@ class Revolved(RestShape):
     @property
     def volume(self) -> float:
         """Volume of the frustums under the outline [m³]; exact for the round body."""
-        (r, z), (s, w) = (each.T for each in self._segments)
+        (r, z), (s, w) = (each.T for each in self.segments)
         return float(np.pi / 3.0 * np.sum((w - z) * (r * r + r * s + s * s)))
 
     def support(self, directions: Points) -> Distances:
@@ -64,7 +64,7 @@ class Revolved(RestShape):
 
     def _in_plane(self, p: Profile) -> Distances:
         """Distance to the nearest segment, negative where a ray outwards crosses an odd number of segments."""
-        start, end = self._segments
+        start, end = self.segments
         along = end - start
         offset = p[:, None] - start
         share = np.clip((offset * along).sum(axis=2) / (along * along).sum(axis=1), 0.0, 1.0)

@@ -6,7 +6,7 @@ import trimesh
 from rigid_scenes import ball, body, cube
 
 from sim.core.motion import rotation
-from sim.rigid.contacts import Contacts, reduce_manifold, tangent_basis
+from sim.rigid.contact_solver import tangent_basis
 from sim.shapes.body_geometry import BodyGeometry
 
 
@@ -77,56 +77,6 @@ def test_corner_balls_of_a_box_touch_all_three_faces():
     assert np.count_nonzero(corners) == 8
     # Else a box would stand on feet of uneven length, and rock.
     np.testing.assert_allclose(to_faces[corners], np.repeat(radii[corners, None], 3, axis=1), rtol=1e-8)
-
-
-def test_distance_grid_of_a_mesh_agrees_with_its_exact_distance(tmp_path):
-    path = tmp_path / "ball.ply"
-    trimesh.creation.icosphere(subdivisions=3, radius=0.1).export(path)
-    geometry = BodyGeometry(body("m", {"type": "mesh", "file": str(path)}))
-    points = np.random.default_rng(0).normal(size=(200, 3))
-    points *= 0.105 / np.linalg.norm(points, axis=1, keepdims=True)
-    cell = 0.2 / 48
-    # Trilinear interpolation: cell²/(4 R) for the curvature, and at the facets' edges, where the distance has a kink of
-    # 8 degrees, half a cell's diagonal times the slope of half of that.
-    tolerance = cell**2 / 0.4 + 0.87 * cell * np.sin(np.deg2rad(4.0))
-    np.testing.assert_allclose(geometry.contact_distance(points), geometry.signed_distance(points), atol=tolerance)
-    normal = geometry.contact_normal(points)
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
-    assert np.min(np.einsum("ij,ij->i", normal, points) / 0.105) > np.cos(np.deg2rad(8.0))  # facets turn by 7°
-
-
-def patch_of(points: np.ndarray, gap: np.ndarray | None = None) -> Contacts:
-    """Contacts under a horizontal face; all touch unless they have gaps [m]."""
-    count = len(points)
-    keys = np.stack([np.zeros(count), np.ones(count), np.arange(count)], axis=1).astype(np.int64)
-    up = np.tile([0.0, 0.0, 1.0], (count, 1))
-    return Contacts(keys[:, 0], keys[:, 1], keys, points, up, np.zeros(count) if gap is None else gap)
-
-
-@pytest.mark.parametrize("angle", np.linspace(0.0, np.pi / 2, 12))
-def test_reduction_keeps_the_corners_of_a_square_however_it_is_turned(angle):
-    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9), [0.0]), axis=-1).reshape(-1, 3)
-    points = rotation.rotated(rotation.exponential(np.array([0.0, 0.0, angle])), grid)
-    kept = set(reduce_manifold(patch_of(points), frozenset(), margin=0.01).tolist())
-    corners = set(np.flatnonzero(np.all(np.abs(grid[:, :2]) == 1.0, axis=1)).tolist())
-    assert corners <= kept
-    assert len(kept) <= 9
-
-
-def test_reduction_prefers_the_points_of_the_last_step_among_equals():
-    points = np.array([[-1, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=float)
-    twice = patch_of(np.concatenate([points, points]))
-    last = frozenset((0, 1, feature) for feature in (4, 5, 6, 7))
-    assert {4, 5, 6, 7} <= set(reduce_manifold(twice, last, margin=0.01).tolist())
-
-
-def test_reduction_keeps_the_bumps_that_a_body_stands_on_and_not_a_rim_above_them():
-    angle = np.arange(16) * np.pi / 8
-    rim = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
-    feet = 0.6 * rim[[1, 6, 11]]
-    gap = np.concatenate([np.full(len(rim), 0.009), [-0.001, -0.0008, -0.0009]])
-    kept = set(reduce_manifold(patch_of(np.concatenate([rim, feet]), gap), frozenset(), margin=0.01).tolist())
-    assert {16, 17, 18} <= kept
 
 
 def test_tangents_are_orthonormal_to_the_normal():

@@ -1,0 +1,126 @@
+"""Tables of shapes, with their balls and distances, as the kernel of contacts reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.rigid import collision_kernels as kernels
+from sim.rigid.contacts import FEATURE_BITS, WALL_BITS, Array, Indices
+from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
+from sim.shapes.revolved import Revolved
+from sim.shapes.solid import ShapeError
+
+SLANT = 0.03  # how far outside of a ball's cone a contact normal may be [rad]
+SLANT_ON_GRIDS = 0.3  # likewise, on distance grids, whose normals are no better than this [rad]
+
+_SIZES: dict[type, tuple[int, Callable[[Any], tuple[float, float, float]]]] = {
+    Sphere: (kernels.SPHERE, lambda shape: (shape.radius, 0.0, 0.0)),
+    Box: (kernels.BOX, lambda shape: tuple(0.5 * edge for edge in shape.size)),
+    Cylinder: (kernels.CYLINDER, lambda shape: (shape.radius, 0.5 * shape.height, 0.0)),
+    Capsule: (kernels.CAPSULE, lambda shape: (shape.radius, 0.5 * shape.height, 0.0)),
+    Torus: (kernels.TORUS, lambda shape: (shape.major_radius, shape.minor_radius, 0.0)),
+    Cone: (kernels.CONE, lambda shape: (shape.radius, shape.height, 0.0)),
+}
+"""Kind and size of a primitive, as `distance_to` takes them."""
+
+
+class CollisionShapes:
+    """The shapes of all bodies, each once, however many bodies have it.
+
+    Attributes:
+        of_body: number of the shape of each body, (b,) int32.
+        tables: as `find_contacts` takes them.
+        most_balls: of a shape.
+    """
+
+    def __init__(self, geometries: Sequence[BodyGeometry]) -> None:
+        shapes = list({id(geometry): geometry for geometry in geometries}.values())
+        numbers = {id(geometry): number for number, geometry in enumerate(shapes)}
+        self.of_body = np.array([numbers[id(geometry)] for geometry in geometries], dtype=np.int32)
+        whole, sizes = np.zeros((len(shapes), 11), dtype=np.int32), np.zeros((len(shapes), 19))
+        balls, clusters = [], []
+        values, edges = [np.zeros(1, dtype=np.float32)], [np.zeros((1, 4))]
+        for number, geometry in enumerate(shapes):
+            shape, row, size = geometry.solid.shape, whole[number], sizes[number]
+            size[kernels.CENTRE :][:3], size[kernels.LOW :][:3] = geometry.centre_of_mass, geometry.bounds[0]
+            size[kernels.HIGH :][:3], size[kernels.REACH] = geometry.bounds[1], min(geometry.reach, kernels.FAR)
+            size[kernels.STEP], size[kernels.SLANT] = geometry.normal_step, SLANT
+            if type(shape) in _SIZES:
+                row[kernels.KIND], size_of = _SIZES[type(shape)]
+                size[kernels.SIZE :][:3] = geometry.solid.scale * np.asarray(size_of(shape))
+            elif isinstance(shape, Revolved):
+                start, end = (geometry.solid.scale * each for each in shape.segments)
+                row[kernels.KIND], row[kernels.FIRST_EDGE] = kernels.PROFILE, sum(map(len, edges))
+                row[kernels.EDGES] = len(start)
+                edges.append(np.concatenate([start, end - start], axis=1))
+            else:
+                grid = geometry.grid
+                row[kernels.KIND], row[kernels.FIRST_VALUE] = kernels.GRID, sum(map(len, values))
+                row[kernels.NODES :][:3] = grid.values.shape
+                size[kernels.ORIGIN :][:3], size[kernels.SPACING] = grid.origin, grid.spacing
+                size[kernels.SLANT] = SLANT_ON_GRIDS
+                values.append(grid.values.ravel())
+            own = _in_clusters(geometry)
+            row[kernels.FIRST_BALL], row[kernels.BALLS] = sum(map(len, balls)), len(own)
+            groups = _clusters_of(own)
+            row[kernels.FIRST_CLUSTER], row[kernels.CLUSTERS] = sum(map(len, clusters)), len(groups)
+            balls.append(own)
+            clusters.append(groups)
+        self.tables = kernels.Shapes(
+            whole, sizes, *(np.concatenate(parts) for parts in (balls, clusters, values, edges))
+        )
+        self.most_balls = int(whole[:, kernels.BALLS].max())
+        if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
+            raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
+        self._sides = np.array([[_sides(one, two) for two in shapes] for one in shapes], dtype=np.int32)
+
+    def sides(self, first: Indices, second: Indices) -> NDArray[np.int32]:
+        """Whose balls are to be looked at in pairs of bodies: 1 the first's, 2 the second's, 3 both, (k,)."""
+        return self._sides[self.of_body[first], self.of_body[second]]
+
+    def balls_of(self, body: Indices, feature: Indices) -> Array:
+        """The balls that contacts name: centre, radius, axis, cone, (k, 8)."""
+        number = feature & ((1 << (FEATURE_BITS - WALL_BITS)) - 1)
+        found: Array = self.tables.balls[self.tables.whole[self.of_body[body], kernels.FIRST_BALL] + number]
+        return found
+
+
+def _sides(one: BodyGeometry, two: BodyGeometry) -> int:
+    if one.sees_all_contacts_with(two):
+        return 1
+    return 2 if two.sees_all_contacts_with(one) else 3
+
+
+def _in_clusters(geometry: BodyGeometry) -> Array:
+    """The balls of a shape, (m, 8), neighbours together: the leaves of a tree that halves them by median."""
+    balls = geometry.balls
+    table = np.concatenate([balls.centres.T, balls.radii[:, None], balls.axes.T, balls.cones[:, None]], axis=1)
+    order: list[Indices] = []
+    stack = [np.arange(len(table))]
+    while stack:
+        rows = stack.pop()
+        if len(rows) <= kernels.BALLS_PER_CLUSTER:
+            order.append(rows)
+            continue
+        axis = int(np.argmax(np.ptp(table[rows, :3], axis=0)))
+        rows = rows[np.argsort(table[rows, axis], kind="stable")]
+        clusters = -(-len(rows) // kernels.BALLS_PER_CLUSTER)
+        half = kernels.BALLS_PER_CLUSTER * (clusters // 2)  # all clusters but the last are full
+        stack += [rows[half:], rows[:half]]
+    return table[np.concatenate(order)]
+
+
+def _clusters_of(balls: Array) -> Array:
+    """Centre and radius of a ball around each of the clusters, (c, 4)."""
+    clusters = []
+    for begin in range(0, len(balls), kernels.BALLS_PER_CLUSTER):
+        own = balls[begin : begin + kernels.BALLS_PER_CLUSTER]
+        centre = 0.5 * (own[:, :3].min(axis=0) + own[:, :3].max(axis=0))
+        radius = (np.sqrt(np.square(own[:, :3] - centre).sum(axis=1)) + own[:, 3]).max()
+        clusters.append([*centre, radius])
+    return np.array(clusters)
