@@ -384,6 +384,8 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of the frames (default: %(default)s)")
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
+    if unknown := set(arguments.scenes) - set(SCENES):
+        parser.error(f"no scene {', '.join(sorted(unknown))}; there are {', '.join(SCENES)}")
     initialize(arguments.device)
     rows = []
     for name in arguments.scenes or SCENES:
