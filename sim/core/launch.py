@@ -336,7 +336,7 @@ def large_kernel(function: Callable[..., Any]) -> FastKernel:
 
 
 def kernel_of_host_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator in place of `ti.kernel`: the kernel may take bundles of numpy's arrays, which Taichi itself passes on.
+    """Decorator in place of `ti.kernel`: bundles may hold numpy's arrays, too, which Taichi itself passes on.
 
     For arrays whose sizes change from launch to launch: one costs some 10 us, and on a GPU its way there and back.
     """

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.motion.paths import Poses
@@ -129,10 +130,10 @@ class CollisionDetector:
         return CollisionShapes(self._geometries)
 
     @cached_property
-    def _work(self) -> Array:
+    def _work(self) -> ti.Ndarray:
         from sim.rigid.collision_kernels import SCRATCH
 
-        return np.empty((BLOCKS * 2 * self._shapes.most_balls, SCRATCH))
+        return ti.ndarray(ti.f64, (BLOCKS * 2 * self._shapes.most_balls, SCRATCH))
 
     def _is_of(self, pairs: Indices, is_active: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether one body of a pair is active, (k,)."""
@@ -194,7 +195,7 @@ class CollisionDetector:
             Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body),
             np.array(walls or [[0.0] * 7]),
             np.concatenate([[-1], last]),
-            shapes.tables,
+            shapes.on_device,
             2 * shapes.most_balls,
             BLOCKS,
             self._work,

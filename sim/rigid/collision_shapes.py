@@ -6,7 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
+from taichi.lang.util import to_taichi_type
 
 from sim.rigid import collision_kernels as kernels
 from sim.rigid.contacts import FEATURE_BITS, WALL_BITS, Array, Indices
@@ -34,7 +36,7 @@ class CollisionShapes:
 
     Attributes:
         of_body: number of the shape of each body, (b,) int32.
-        tables: as `find_contacts` takes them.
+        tables: what `find_contacts` reads, in the host's memory; `on_device` in the device's, which keeps it.
         most_balls: of a shape.
     """
 
@@ -74,6 +76,7 @@ class CollisionShapes:
         self.tables = kernels.Shapes(
             whole, sizes, *(np.concatenate(parts) for parts in (balls, clusters, values, edges))
         )
+        self.on_device = kernels.Shapes(*map(_kept, self.tables))
         self.most_balls = int(whole[:, kernels.BALLS].max())
         if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
             raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
@@ -88,6 +91,13 @@ class CollisionShapes:
         number = feature & ((1 << (FEATURE_BITS - WALL_BITS)) - 1)
         found: Array = self.tables.balls[self.tables.whole[self.of_body[body], kernels.FIRST_BALL] + number]
         return found
+
+
+def _kept(numbers: NDArray[np.generic]) -> ti.Ndarray:
+    """An array of these numbers, of their type, on the device."""
+    array = ti.ndarray(to_taichi_type(numbers.dtype), numbers.shape)
+    array.from_numpy(numbers)
+    return array
 
 
 def _sides(one: BodyGeometry, two: BodyGeometry) -> int:
