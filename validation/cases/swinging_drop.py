@@ -98,7 +98,8 @@ def draw(results: Sequence[CaseResult]) -> Figure:
         resolutions.plot(results[0].series[f"times_{count}"], curve, color=shade, label=f"radius / {count}")
     for axes, title in ((solvers, "solvers"), (resolutions, "refinement")):
         for turn in np.arange(0.25, SWINGING, 0.5):  # extremes of a swing at Rayleigh's frequency
-            axes.axvline(turn, color=THEORY, linewidth=0.5)
+            axes.axvline(turn, ymax=0.75, color=THEORY, linewidth=0.5)
+        axes.set_ylim(-0.15, 0.25)  # with room for the legend
         label_axes(axes, "time / Rayleigh's period", "elongation", title)
     return figure
 
