@@ -46,6 +46,11 @@ _GRAPHS_PROBE = """
 from sim.core.cuda_launch import makes_graphs
 assert makes_graphs(), 'threads have no folders of their own here'
 """
+_THREADS_PROBE = """
+from sim.core.runtime import initialize, slow_loops
+initialize('cpu')
+assert not slow_loops(), slow_loops()
+"""
 _CODEC_PROBE = """
 import av
 av.codec.Codec('libx264', 'w')
@@ -139,6 +144,10 @@ def _examine_devices() -> Iterable[Examination]:
             with_graphs, reason = _run_child(_GRAPHS_PROBE)
             how = "launched as graphs" if with_graphs else f"launched one by one, which is slower: {reason}"
             yield Examination("device cuda", "ok", f"computes; kernels are {how}")
+        elif answer == "ok" and device == "cpu":
+            with_own, reason = _run_child(_THREADS_PROBE)
+            how = "threads of our own" if with_own else f"Taichi's threads, which is slower: {reason}"
+            yield Examination("device cpu", "ok", f"computes; loops have {how}")
         elif answer == "ok":
             yield Examination(f"device {device}", "ok", "computes")
         elif device == "cpu":

@@ -6,7 +6,6 @@ import numpy as np
 import taichi as ti
 
 from sim.cloth.bundles import Air, NodeMotion, Nodes
-from sim.cloth.loop_costs import NODE_IN_AIR_NS
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
@@ -14,7 +13,6 @@ from sim.core.arrays import Vectors, on_device
 from sim.core.bundles import with_room
 from sim.core.launch import kernel
 from sim.core.parameters import KeyRefusedError, Vector3
-from sim.core.scheduling import is_short
 
 WIND = -1
 """Source of air that is nothing but the wind of a cloth's parameters."""
@@ -54,7 +52,6 @@ class ClothAir:
         self.source, self.density = on_device(np.full(count, WIND)), ti.ndarray(ti.f32, count)
         self.wind = ti.Vector.ndarray(3, ti.f32, count)
         self.acts = self.is_shared = False
-        self._is_short = is_short(state.vertex_count, NODE_IN_AIR_NS)
         triangles = host.triangles
         order = np.argsort(triangles.ravel(), kind="stable")
         start = np.searchsorted(triangles.ravel()[order], np.arange(state.vertex_count + 1))
@@ -104,7 +101,6 @@ class ClothAir:
             state.vertex_count,
             gravity,
             dt,
-            self._is_short,
         )
 
 
@@ -147,7 +143,6 @@ def predict_in_air(
     count: ti.i32,
     gravity: ti.math.vec3,
     dt: ti.f32,
-    is_short: ti.template(),
 ):
     """Accelerate nodes by gravity and by their share of the force on each of their triangles; where that leads in dt.
 
@@ -165,8 +160,6 @@ def predict_in_air(
     with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
     not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for t in range(triangle_count):
         a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
         x_a = position[a]
@@ -200,8 +193,6 @@ def predict_in_air(
             force *= area
             air.impulse[t] = air.impulse[t] + dt * force  # += is an atomic operation
         air.force[t] = force
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for i in range(count):
         w_i = nodes.inverse_mass[i]
         if w_i > 0.0:

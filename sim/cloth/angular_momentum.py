@@ -4,13 +4,11 @@ import numpy as np
 import taichi as ti
 
 from sim.cloth.bundles import NodeMotion, Nodes
-from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.state import ClothState
 from sim.core.arrays import Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, Share, Tree, device_lanes, reduced, runs_on_gpu
-from sim.core.scheduling import is_short
 
 QUANTITIES = 13
 """Mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)."""
@@ -53,9 +51,7 @@ class AngularMomentumCorrection:
             first, end = (int(node) for node in state.host.first_node[cloth : cloth + 2])
             count = end - first if state.is_free[cloth] else 0
             share = Share(lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._tree)
-            return_angular_momentum(
-                state.nodes, state.motion, dt, first, count, share, self._turn, is_short(end - first, NODE_NS)
-            )
+            return_angular_momentum(state.nodes, state.motion, dt, first, count, share, self._turn)
         self._is_warm = True
 
 
@@ -75,15 +71,12 @@ def return_angular_momentum(
     count: ti.i32,
     share: Share,
     turn: Vectors,
-    is_short: ti.template(),
 ):
     """Rotate the nodes of a cloth so that the corrections of its springs have no angular momentum.
 
     Moments are about the first node; `turn` becomes the rotation, and the centre of mass from there.
     """
     (tree,) = ti.static((share.tree,))
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for lane in range(tree.lanes):
         mass = 0.0
         moment = ti.math.vec3(0.0)
@@ -125,8 +118,6 @@ def return_angular_momentum(
         )
         turn[0] = -(inertia / whole).inverse() @ (spin / whole)
         turn[1] = centre
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for i in range(first, first + count):
         r_i = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[first], ti.f32) - turn[1]
         nodes.displacement[i] = nodes.displacement[i] + turn[0].cross(r_i)

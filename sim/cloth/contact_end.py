@@ -37,7 +37,6 @@ def end_contacts(
     met: PatchPairArrays,
     workers: ti.math.ivec3,
     counters: Counters,
-    is_short: ti.template(),
 ) -> ti.math.ivec3:
     """Test `count` contacts (`repair_crossing`); if none failed, measure how far they displaced patches; if not farther
     than allowed for, displacements are final: note where they lead, and what of the lists they use up.
@@ -62,8 +61,6 @@ def end_contacts(
         workers[2],
     )
     counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for c in range(contacts_end):
         repair_crossing(
             c,
@@ -77,8 +74,6 @@ def end_contacts(
             counters.found,
         )
     begin_sharing(counters.taken, 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for worker in range(displaced_end):
         stop = ti.select(counters.found[0] == 0, patches.corners.count, 0)
         m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
@@ -95,8 +90,6 @@ def end_contacts(
                 counters.found,
             )
             m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for i in range(vertices_end):
         if counters.found[0] + counters.found[1] + counters.found[2] == 0:
             nodes.expected[i] = nodes.position[i] + nodes.displacement[i]

@@ -25,7 +25,6 @@ def push_apart(
     impulses: Impulses,
     nodes: PushedNodes,
     bodies: PushedBodies,
-    is_short: ti.template(),
 ):
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
@@ -35,11 +34,9 @@ def push_apart(
     displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, touched_end, bodies_end = count, touched_count, bodies.count
+    contacts_end, touched_end = count, touched_count
     moved_end = touched_count + bodies.count
     new_end = starts * ti.max(count, touched_count, bodies.count)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for place in range(new_end):
         if place < touched_count:
             i = nodes.touched[place]
@@ -53,31 +50,14 @@ def push_apart(
             c = impulses.pushing[place]
             impulses.impulse_before[c] = impulses.impulse[c]
             impulses.impulse_given[c] = impulses.impulse[c]
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-        for step in range(STEPS):
-            for place in range(contacts_end):
-                push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
-            for place in range(touched_end):
+    for step in ti.static(range(STEPS)):
+        for place in range(contacts_end):
+            push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
+        for place in range(moved_end):
+            if place < touched_end:
                 move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
-            for b in range(bodies_end):
-                move_body(b, momenta[step + 1], impulses, bodies)
-    else:
-        for step in ti.static(range(STEPS)):
-            for place in range(contacts_end):
-                push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
-            if ti.static(runs_on_gpu()):
-                for place in range(moved_end):
-                    if place < touched_end:
-                        move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
-                    else:
-                        move_body(place - touched_end, momenta[step + 1], impulses, bodies)
             else:
-                for place in range(touched_end):
-                    move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
-                ti.loop_config(serialize=True)
-                for b in range(bodies_end):
-                    move_body(b, momenta[step + 1], impulses, bodies)
+                move_body(place - touched_end, momenta[step + 1], impulses, bodies)
 
 
 @func
@@ -149,7 +129,6 @@ def finish_push(
     impulses: Impulses,
     nodes: PushedNodes,
     bodies: PushedBodies,
-    is_short: ti.template(),
 ):
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
@@ -157,15 +136,11 @@ def finish_push(
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, touched_end, bodies_end = finishes * count, finishes * touched_count, finishes * bodies.count
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for place in range(contacts_end):
         c = impulses.pushing[place]
         impulses.push[place] = (impulses.impulse[c] - impulses.impulse_given[c]) / impulses.unit
         if contacts.kind[c] >= 0:
             give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for place in range(touched_end):
         i = nodes.touched[place]
         given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)

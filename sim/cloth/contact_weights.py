@@ -7,7 +7,7 @@ from sim.cloth.contact_answers import answered, body_mobility, give_body_togethe
 from sim.cloth.contact_supports import SHARES_PER_UNIT, answer_of, hold, support_between, turned_to_support
 from sim.cloth.proximity_contacts import INACTIVE, WALL
 from sim.core.bundles import func
-from sim.core.launch import kernel
+from sim.core.launch import large_kernel
 from sim.core.warps import whole_warps
 
 LEAST_FREE_WEIGHT = 0.05
@@ -18,7 +18,7 @@ ALONE = -1
 """In the place of the first use of a vertex: what stands touches it, and nothing else does."""
 
 
-@kernel
+@large_kernel
 def weigh_contacts(
     contacts: Contacts,
     impulses: Impulses,
@@ -27,7 +27,6 @@ def weigh_contacts(
     sums: NodeSums,
     bodies: PushedBodies,
     is_first: ti.i32,
-    is_short: ti.template(),
 ):
     """List the contacts that push, and compute their diagonal D; before the first round of what was found, forget their
     impulses, and keep what displacements were `predicted` as it was looked for.
@@ -50,8 +49,6 @@ def weigh_contacts(
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for i in range(all_end):
         if i < vertex_count:
             sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
@@ -63,8 +60,6 @@ def weigh_contacts(
                     sums.held_sums[6 * i + k] = 0
         if i < bodies.count:
             bodies.load[i] = ti.cast(0, ti.i64)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for c in range(contacts_end):
         impulses.mobility[c] = 0.0
         if contacts.floor[c] > 0.5 * INACTIVE:
@@ -89,8 +84,6 @@ def weigh_contacts(
                 hold(c, contacts, most, sums)
             if free >= LEAST_FREE_WEIGHT:
                 impulses.mobility[c] = 1.0
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for i in range(vertices_end):
         if nodes.uses[2 * i] == 1 and nodes.uses[2 * i + 1] == 1:
             nodes.uses[2 * i] = ALONE
@@ -105,8 +98,6 @@ def weigh_contacts(
                 of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
                 own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
                 nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for c in range(weighed_end):
         push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
         if c < contacts_end and impulses.mobility[c] > 0.0:

@@ -18,14 +18,12 @@ from sim.cloth.bundles import NodeSums, PushedNodes
 from sim.cloth.contact_iteration import STEPS
 from sim.cloth.contact_weights import weigh_contacts
 from sim.cloth.continuous_response import push
-from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.core.bundles import with_room
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction, runs_on_gpu
-from sim.core.scheduling import is_short
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -36,9 +34,6 @@ in stacks and impacts; two layers under their weight need one step."""
 
 REPAIRS = 4
 """Rounds in which crossing pairs are pushed before they become impact zones."""
-
-MANY_CONTACTS = 16
-"""Contacts a vertex for which kernels are compiled: heaps and knots come to ten and more."""
 
 RECOVERY_TIME_S = 0.01
 """Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""
@@ -202,7 +197,7 @@ class ContinuousContacts:
                 self._velocities = None
                 return False  # the solver says which quantity is not finite, or ran away
             if found:
-                self._push_in_turns(state, found, relax, begun)
+                self._push_in_turns(state, relax, begun)
             left, is_beyond, not_finite = self._keep_apart(state, found)
             if not_finite:
                 self._velocities = None
@@ -220,8 +215,7 @@ class ContinuousContacts:
 
     def _warm_up(self, state: ClothState) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
-        for short in sorted({self._is_short(0), self._is_short(MANY_CONTACTS * state.vertex_count)}):
-            self._begin_push(state, is_first=True, short=short)()
+        self._begin_push(state, is_first=True)()
         if self._pairs.meets:
             self._pairs.warm_up()
 
@@ -240,14 +234,14 @@ class ContinuousContacts:
             self._pairs.find(state, self._contacts, recovery, is_ahead=is_ahead)
             asked = self.rigid.find(state, self._patches, self._pairs.motion, self._contacts, recovery)
             if is_ahead:
-                begun = self._begin_push(state, is_first=True, short=False), relax()
+                begun = self._begin_push(state, is_first=True), relax()
                 if not self._has_bounds():
                     return -1, None
                 if not self._pairs.looked()[1]:
                     continue
             found, *ends = asked()
-            is_short = self._pairs.make_room_for(ends)
-            if not self._contacts.make_room_for(found) and not is_short:
+            had_no_room = self._pairs.make_room_for(ends)
+            if not self._contacts.make_room_for(found) and not had_no_room:
                 return found, begun
 
     def _has_bounds(self) -> bool:
@@ -258,32 +252,31 @@ class ContinuousContacts:
     def _push_in_turns(
         self,
         state: ClothState,
-        count: int,
         relax: Callable[[], Callable[[], bool]],
         begun: tuple[Callable[[], list[int]], Callable[[], bool]] | None,
     ) -> None:
         """Push in turns with the springs, for as long as these `relax`; the first round may have begun."""
-        short, is_first = self._is_short(count), True
+        is_first = True
         while True:
-            pushed, go_on = begun or (self._begin_push(state, is_first=is_first, short=short), relax())
+            pushed, go_on = begun or (self._begin_push(state, is_first=is_first), relax())
             found = pushed()
             pushing, _, _, settled = found
             if not (pushing or settled) or not go_on():
                 break
             self._iterations += STEPS if pushing else settled
             is_first, begun = False, None
-        self._push_further(state, found, short=short)
+        self._push_further(state, found)
 
-    def _push_further(self, state: ClothState, found: Sequence[int], *, short: bool) -> None:
+    def _push_further(self, state: ClothState, found: Sequence[int]) -> None:
         """More steps, where the round that `found` what `push` returns was not enough."""
         pushing, _, is_missing, settled = found
         self._iterations += STEPS if pushing else settled
         if pushing and is_missing:
             for step in range(0, MORE_ITERATIONS, STEPS):
-                self._push_on(state, step, finishes=step + STEPS >= MORE_ITERATIONS, short=short)
+                self._push_on(state, step, finishes=step + STEPS >= MORE_ITERATIONS)
             self._iterations += MORE_ITERATIONS
 
-    def _begin_push(self, state: ClothState, *, is_first: bool, short: bool) -> Callable[[], list[int]]:
+    def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
         """A round of the first `STEPS` steps; asks for what `push` returns."""
         weigh_contacts(
             self._contacts.found,
@@ -293,11 +286,10 @@ class ContinuousContacts:
             self._sums,
             self.rigid.bodies.pushed,
             int(is_first),
-            short,
         )
-        return self._push_on(state, 0, finishes=True, short=short)
+        return self._push_on(state, 0, finishes=True)
 
-    def _push_on(self, state: ClothState, first: int, *, finishes: bool, short: bool) -> Callable[[], list[int]]:
+    def _push_on(self, state: ClothState, first: int, *, finishes: bool) -> Callable[[], list[int]]:
         """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
         return push.later(
             _momenta_from(first),
@@ -309,7 +301,6 @@ class ContinuousContacts:
             self._sums,
             state.thickness,
             self.rigid.bodies.pushed,
-            short,
         )
 
     def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
@@ -319,8 +310,7 @@ class ContinuousContacts:
             if not found[0]:
                 return found
             self._repaired += found[0]
-            short = self._is_short(count)
-            self._push_further(state, self._begin_push(state, is_first=False, short=short)(), short=short)
+            self._push_further(state, self._begin_push(state, is_first=False)())
         found = self._finish(state, count)
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
@@ -341,10 +331,6 @@ class ContinuousContacts:
             self._conclude(self._pairs.outcome)
             self._velocities = box_of(state.velocity, 0, state.vertex_count, self._ends)
         return asked()
-
-    def _is_short(self, count: int) -> bool:
-        """Whether loops over so many contacts, and over all vertices, are."""
-        return is_short(count, CONTACT_NS) and is_short(self._state.vertex_count, COPIED_NODE_NS)
 
 
 class ImpactZones:

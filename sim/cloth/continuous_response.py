@@ -11,7 +11,7 @@ weights). Where all contacts push alike, as between two layers, D_c is exact and
 of contacts Mazhar et al. 2015) brings the others.
 
 Sums over contacts are sums of integers, in units far below anything that matters: the same for any order of contacts
-and threads. Loops over bodies are serial on a CPU: a few bodies are done sooner than other threads wake.
+and threads.
 """
 
 import taichi as ti
@@ -20,13 +20,13 @@ from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, Pushed
 from sim.cloth.contact_answers import relative_displacement, thickness_between
 from sim.cloth.contact_iteration import Momenta, finish_push, push_apart
 from sim.core.arrays import Floats
-from sim.core.launch import kernel
+from sim.core.launch import large_kernel
 
 TOLERANCE = 0.02
 """Part of their thickness by which contacts may miss what they should keep."""
 
 
-@kernel
+@large_kernel
 def push(
     momenta: Momenta,
     starts: ti.i32,
@@ -37,7 +37,6 @@ def push(
     sums: NodeSums,
     thickness: Floats,
     bodies: PushedBodies,
-    is_short: ti.template(),
 ) -> ti.math.ivec4:
     """Some steps of the iteration of a round (`weigh_contacts`), and where they lead if it `finishes`.
 
@@ -47,10 +46,8 @@ def push(
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
     measured_end = finishes * pushing_count
-    push_apart(momenta, starts, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
-    finish_push(finishes, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
+    push_apart(momenta, starts, pushing_count, touched_count, contacts, impulses, nodes, bodies)
+    finish_push(finishes, pushing_count, touched_count, contacts, impulses, nodes, bodies)
     for place in range(measured_end):
         c = impulses.pushing[place]
         w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)

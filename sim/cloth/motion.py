@@ -36,7 +36,6 @@ def finish_step(
     limit: ti.i32,
     dt: ti.f32,
     reasons: Integers,
-    is_short: ti.template(),
 ):
     """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
 
@@ -47,8 +46,6 @@ def finish_step(
     Nothing is done unless the three `reasons` why the substep may not be over are 0.
     """
     end = ti.select(reasons[0] + reasons[1] + reasons[2] == 0, position.shape[0], 0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for i in range(end):
         u_i = nodes.displacement[i]
         v_i = motion.velocity[i] + (u_i - (motion.carry[i] + dt * motion.velocity[i])) / dt

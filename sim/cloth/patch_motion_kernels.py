@@ -64,7 +64,6 @@ def look_at_patches(
     ageing: Ageing,
     workers: ti.math.ivec2,
     counters: Counters,
-    is_short: ti.template(),
 ) -> ti.math.ivec4:
     """Where patches are, and how they move in this substep; then, if the list of their pairs holds, which of these have
     to be searched, and of which some elements are due.
@@ -90,8 +89,6 @@ def look_at_patches(
     motion, budget, tree = ti.static((patches.bounds.motion, patches.budget, of_vertices.tree))
     patches_end, pairs_end = workers[0], workers[1]
     counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for lane in range(tree.lanes):
         most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
         for k in range(of_vertices.items):

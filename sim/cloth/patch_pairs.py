@@ -26,7 +26,6 @@ from sim.cloth.bundles import (
     Two,
 )
 from sim.cloth.contact_end import end_contacts
-from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_motion_kernels import (
     LARGEST_STILL,
     look_at_patches,
@@ -39,7 +38,7 @@ from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import NEVER, carry_pieces
 from sim.core.bundles import with_room
 from sim.core.reductions import LaneReduction
-from sim.core.scheduling import is_short, workers_for
+from sim.core.scheduling import workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.proximity_contacts import ContactList
@@ -180,7 +179,6 @@ class PatchPairs:
         self._maxima = LaneReduction(maxima=7, sums=0)
         self._astray, self._half_thickness, self._still, self._fits = 0.0, 0.0, 0.0, True
         self.due_count = self.expired_count = 0
-        self._is_short = is_short(patches.vertex_count, NODE_NS)
         self._needed = ti.ndarray(ti.i32, max(m, 1))
         self._allocate(8 * max(m, 1))
 
@@ -303,7 +301,6 @@ class PatchPairs:
             ageing or Ageing(0.0, 0.0, self.on_device.left, self.on_device.left),
             (workers_for(patches.count) if looks_at_patches else 0, workers_for(self.count) if ageing else 0),
             self.counters,
-            self._is_short,
         )
 
         def answer() -> tuple[float, bool]:
@@ -351,5 +348,4 @@ class PatchPairs:
             self.on_device,
             (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
             self.counters,
-            self._is_short,
         )

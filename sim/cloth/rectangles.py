@@ -7,7 +7,6 @@ import taichi as ti
 
 from sim.cloth.bundles import Lines
 from sim.cloth.device_cells import SHEAR_SWEEPS
-from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, strips_of
 from sim.cloth.row_springs import bend_lines, measure_lines, solve_cells_in_rows, solve_lines, straighten_lines
@@ -17,7 +16,6 @@ from sim.cloth.springs import bend_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
 from sim.core.host_access import put
 from sim.core.reductions import runs_on_gpu
-from sim.core.scheduling import is_short
 
 ALONG_Y, ALONG_X = 0, 1
 """Directions of lines: upright blocks, then turned ones."""
@@ -68,7 +66,6 @@ class RectangleSprings:
             tuple(ti.ndarray(ti.f32, lines.strips * LANES) for lines in self._lines) for _ in range(2)
         )
         self._cell_stiffness = self._poisson = self._bend_damping = 0.0
-        self._is_short = is_short(grid.columns * grid.rows, NODE_IN_ROWS_NS)
 
     def take_parameters(self, cloth: ClothParameters) -> None:
         """Stiffness and damping as they are now; `springs` says how those of a sheet become those of its springs."""
@@ -85,7 +82,7 @@ class RectangleSprings:
 
     def displace(self, dt: float, sweeps: int) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps."""
-        state, blocks, short = self._state, self._blocks, self._is_short
+        state, blocks = self._state, self._blocks
         self._load()
         for axis in (ALONG_X, ALONG_Y):
             bend_lines(
@@ -95,7 +92,6 @@ class RectangleSprings:
                 state.quantum,
                 dt * dt,
                 self._bend_damping / dt,
-                short,
             )
         for sweep in range(sweeps):
             for time, parity in product(range(SHEAR_SWEEPS if sweep == 0 else 1), range(2)):
@@ -108,27 +104,26 @@ class RectangleSprings:
                     state.quantum,
                     dt * dt,
                     int(sweep == time == 0),
-                    short,
                 )
             self._solve_threads(dt, is_first=sweep == 0)
         for axis in (ALONG_X, ALONG_Y):
-            straighten_lines(blocks, self._lines[axis], short)
-        store_blocks(blocks, state.nodes, self._lines[ALONG_Y], short)
+            straighten_lines(blocks, self._lines[axis])
+        store_blocks(blocks, state.nodes, self._lines[ALONG_Y])
 
     def sweep(self, dt: float) -> None:
         """Solve the threads once more, after contacts."""
         self._load()
         self._solve_threads(dt, is_first=False)
-        store_blocks(self._blocks, self._state.nodes, self._lines[ALONG_Y], self._is_short)
+        store_blocks(self._blocks, self._state.nodes, self._lines[ALONG_Y])
 
     def _load(self) -> None:
         for lines in self._lines:
-            load_blocks(self._blocks, self._state.nodes, lines, self._is_short)
+            load_blocks(self._blocks, self._state.nodes, lines)
 
     def _solve_threads(self, dt: float, *, is_first: bool) -> None:
-        state, blocks, short = self._state, self._blocks, self._is_short
+        state, blocks = self._state, self._blocks
         for axis in (ALONG_X, ALONG_Y) if self._poisson > 0.0 else ():
-            measure_lines(blocks, self._lines[axis], self._steps[axis], state.quantum, self._strains[axis], short)
+            measure_lines(blocks, self._lines[axis], self._steps[axis], state.quantum, self._strains[axis])
         for axis in (ALONG_X, ALONG_Y):
             solve_lines(
                 blocks,
@@ -141,7 +136,6 @@ class RectangleSprings:
                 self._multipliers,
                 self._poisson,
                 self._strains[1 - axis],
-                short,
             )
 
     def excess(self, dt: float) -> tuple[float, int]:

@@ -19,7 +19,6 @@ from sim.cloth.bundles import (
     Walls,
     Weights,
 )
-from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
@@ -33,7 +32,7 @@ from sim.core.host_access import put
 from sim.core.launch import kernel, large_kernel
 from sim.core.motion.paths import Poses
 from sim.core.reductions import LaneReduction, Share, reduced
-from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
+from sim.core.scheduling import begin_sharing, next_item, workers_for
 from sim.core.walls import Wall
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.device_shapes import GRID, SPHERE, TORUS, Shapes, distance_to
@@ -206,7 +205,6 @@ class RigidContact:
             self._moving,
             self._advance_on_device,
             self._largest_half + self._longest / math.sqrt(3.0),  # a triangle's middle is no farther from a node
-            is_short(len(nodes), NODE_NS),
         )
         return min(at_most, 1.0 / max(float(rate), 1.0e-30))
 
@@ -256,15 +254,12 @@ def fastest_approach(
     moving: Weights,
     advance: Floats,
     half: ti.f32,
-    is_short: ti.template(),
 ) -> ti.f32:
     """Largest inverse of the step that a node and a body bear [1/s].
 
     `moving` has the velocity of each body's centre of mass and the speed by which it turns [m/s], `advance` how far
     what is near may move against it [m].
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for lane in range(share.tree.lanes):
         largest = 0.0
         for k in range(share.items):

@@ -129,13 +129,11 @@ def turn_back(values: ti.template(), strip: ti.i32, along: Lines):
 
 
 @large_kernel
-def load_blocks(blocks: ti.template(), nodes: Nodes, along: Lines, is_short: ti.template()):
+def load_blocks(blocks: ti.template(), nodes: Nodes, along: Lines):
     """Fill the blocks of lines along one direction with the nodes of a cloth, and none beyond its border.
 
     Turned ones get their displacements by `turn`.
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for strip in range(along.strips):
         for k in range(along.other_strips * LANES):
             u, lattice, weight = VectorBlock(0.0), LatticeBlock(0), Block(0.0)
@@ -153,10 +151,8 @@ def load_blocks(blocks: ti.template(), nodes: Nodes, along: Lines, is_short: ti.
 
 
 @kernel
-def store_blocks(blocks: ti.template(), nodes: Nodes, along: Lines, is_short: ti.template()):
+def store_blocks(blocks: ti.template(), nodes: Nodes, along: Lines):
     """Write the displacements of the upright blocks to the nodes of the cloth."""
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(along.length):
         for strip in range(along.strips):
             u = blocks.u[k * along.strips + strip]

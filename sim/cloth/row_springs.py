@@ -1,8 +1,7 @@
 """Springs and cells of a rectangle, eight lines at a time (see `row_blocks`): what `xpbd`, `device_cells` and `threads`
 do for lists, and have the formulas of.
 
-Lines are threads along one direction; `quantum` is the unit of the lattice [m], `dt_squared` in s²; for `is_short` see
-`sim.core.scheduling`.
+Lines are threads along one direction; `quantum` is the unit of the lattice [m], `dt_squared` in s².
 """
 
 import taichi as ti
@@ -28,14 +27,11 @@ def bend_lines(
     quantum: ti.f32,
     dt_squared: ti.f32,
     gamma: ti.f32,
-    is_short: ti.template(),
 ):
     """The bend springs of all lines along one direction, colour by colour, as `solve_bend`.
 
     `stiffness` is of the springs of each line [N/m], (strips * LANES,), `gamma` their damping over stiffness and dt.
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for strip in range(along.strips):
         turn(blocks.u, strip, along)
         strength = Block(0.0)
@@ -110,15 +106,12 @@ def solve_cells_in_rows(
     quantum: ti.f32,
     dt_squared: ti.f32,
     is_first: ti.i32,
-    is_short: ti.template(),
 ):
     """The shear of all cells in every second row of cells, from row `parity` on, as `solve_shear`, for upright lines.
 
     In each row every second cell first, then those between, which share nodes with them: all are computed alike, eight
     at a time, and every second one acts. `steps` are the lengths of a cell [m], `stiffness` is G times its area [J].
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for pair in range((along.length - parity) // 2):
         lower = (2 * pair + parity) * along.strips
         strength = stiffness * dt_squared
@@ -167,14 +160,10 @@ def solve_cells_in_rows(
 
 
 @large_kernel
-def measure_lines(
-    blocks: ti.template(), along: Lines, rest: ti.f32, quantum: ti.f32, strain: Blocks, is_short: ti.template()
-):
+def measure_lines(blocks: ti.template(), along: Lines, rest: ti.f32, quantum: ti.f32, strain: Blocks):
     """Strains at the nodes of all lines along one direction, of the two springs there or the one, for the lines across:
     in blocks of these.
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for strip in range(along.strips):
         turn(blocks.u, strip, along)
         before = Block(0.0)
@@ -206,7 +195,6 @@ def solve_lines(
     multipliers: Blocks,
     poisson: ti.f32,
     across: Blocks,
-    is_short: ti.template(),
 ):
     """The threads along one direction exactly: the Thomas algorithm forth, then back, where nodes move.
 
@@ -214,8 +202,6 @@ def solve_lines(
     each node start at 0 if `is_first`; `across` are the strains at nodes along the other direction, if `poisson` is not
     0.
     """
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for strip in range(along.strips):
         turn(blocks.u, strip, along)
         compliance = Block(0.0)
@@ -273,10 +259,8 @@ def solve_lines(
 
 
 @large_kernel
-def straighten_lines(blocks: ti.template(), along: Lines, is_short: ti.template()):
+def straighten_lines(blocks: ti.template(), along: Lines):
     """Let tension turn with the threads along one direction, in strips with too much of it."""
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for strip in range(along.strips):
         if blocks.is_taut[along.first + strip]:
             turn(blocks.u, strip, along)

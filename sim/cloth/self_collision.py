@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, PatchMotion, Rest
 from sim.cloth.element_blocks import ElementBlocks
-from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.near_pairs import find_near_pairs
 from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
@@ -20,7 +19,7 @@ from sim.cloth.self_collision_kernels import range_of_vectors
 from sim.core.arrays import on_device
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
-from sim.core.scheduling import is_short, workers_for
+from sim.core.scheduling import workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -228,7 +227,7 @@ def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) ->
         ends_of: of six maxima.
     """
     count = end - first
-    asked = range_of_vectors.later(vectors, first, count, ends_of.over(count), is_short(count, NODE_NS))
+    asked = range_of_vectors.later(vectors, first, count, ends_of.over(count))
 
     def answer() -> Box:
         ends = ends_of.unpack(asked()).astype(np.float64)

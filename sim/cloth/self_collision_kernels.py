@@ -362,10 +362,8 @@ def look_at_pair(
 
 
 @kernel
-def range_of_vectors(vectors: Vectors, first: ti.i32, count: ti.i32, share: Share, is_short: ti.template()) -> Results:
+def range_of_vectors(vectors: Vectors, first: ti.i32, count: ti.i32, share: Share) -> Results:
     """Largest components of some vectors, then those of the negative ones, six maxima."""
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for lane in range(share.tree.lanes):
         most, least = ti.math.vec3(-FAR), ti.math.vec3(FAR)
         for k in range(share.items):

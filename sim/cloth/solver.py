@@ -14,7 +14,6 @@ from sim.cloth.device_cells import DeviceCells
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
 from sim.cloth.load import NodeLoad
-from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.motion import finish_step
 from sim.cloth.parameters import (
     DEFAULT_SUBSTEPS,
@@ -37,7 +36,6 @@ from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
 from sim.core.host_access import add, copied, viewed
 from sim.core.parameters import Vector3
-from sim.core.scheduling import is_short
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
 
@@ -172,7 +170,6 @@ class ClothSolver:
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
         self._totals = ClothTotals(self.state, self._springs, self._cells)
         self._frame_dt = 1.0 / frames_per_second
-        self._is_short = is_short(self.state.vertex_count, NODE_NS)
         self.air = ClothAir(self.state)
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
@@ -326,7 +323,7 @@ class ClothSolver:
             nonlocal at_end
             if excess is None:
                 at_end = integrator.excess(dt)
-            finish_step(state.nodes, state.motion, state.position, state.limit, dt, reasons, self._is_short)
+            finish_step(state.nodes, state.motion, state.position, state.limit, dt, reasons)
 
         is_concluded = False
         for contacts in self.contacts:

@@ -1,6 +1,6 @@
 """Sums and maxima over the cloths, on the device: what the diagnostics tell of every frame.
 
-Loops over lanes are serial on a CPU: one thread has them all either way (`sim.core.scheduling`), and none need wake.
+Loops over lanes are serial on a CPU, where one thread has them all either way (`sim.core.scheduling`).
 """
 
 import math

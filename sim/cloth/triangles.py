@@ -6,7 +6,6 @@ from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, Triang
 from sim.cloth.cells import OWN_SHARE, TRIANGLE
 from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
 from sim.cloth.device_springs import TINY_LENGTH
-from sim.cloth.loop_costs import NODE_OF_MESH_NS, TRIANGLE_NS
 from sim.cloth.spring_convergence import LARGEST_RESIDUAL
 from sim.cloth.state import ClothState
 from sim.cloth.threads import STRAIGHTENED, direction_of
@@ -14,7 +13,6 @@ from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import func, with_room
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, LaneReduction, Results, Share, reduced_tree, runs_on_gpu
-from sim.core.scheduling import is_short
 
 ITERATIONS_AT_ONCE = 4
 """Iterations between two looks at how far the last ones led."""
@@ -82,7 +80,6 @@ class TriangleSolver:
         )
         self._expected = ti.Vector.ndarray(2, ti.f32, n)
         self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
-        self._short = is_short(count, TRIANGLE_NS) and is_short(cells.own, NODE_OF_MESH_NS)
         self._left = self._mass = self._least = 0.0
 
     def take_parameters(self) -> None:
@@ -94,29 +91,29 @@ class TriangleSolver:
 
         Once more in a step: from where the nodes are now, with what triangles pushed them by so far as an impulse.
         """
-        system, state, short = self._system, self._state, self._short
+        system, state = self._system, self._state
         share = self._sums.over(system.own)
-        linearize(system, state.nodes, state.carry, dt, short)
-        begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share, short)
+        linearize(system, state.nodes, state.carry, dt)
+        begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share)
         self._left = 1.0
         if is_first:
             self._least = self._mass * (LEAST_ACCELERATION * dt * dt) ** 2
         for first in range(0, MOST_ITERATIONS, ITERATIONS_AT_ONCE):
-            iterate(system, state.nodes, dt, first, share, short)
+            iterate(system, state.nodes, dt, first, share)
             last, whole = decrease(system.work.scalars, first, first + ITERATIONS_AT_ONCE)
             if not last > TOLERANCE**2 * (whole + self._least):
                 self._left = 0.0
                 break
         if is_first:
             self._least += whole
-        finish_iteration(system, state.nodes, state.elastic, self._expected, short)
+        finish_iteration(system, state.nodes, state.elastic, self._expected)
 
     def excess(self) -> tuple[float, int]:
         """Largest excess of strain at a node [-], 1 if `MOST_ITERATIONS` were too few; and how many are beyond
         `LARGEST_RESIDUAL`.
         """
         share = self._of_excess.over(self._system.own)
-        found = measure_node_excess(self._system, self._state.nodes, self._expected, share, self._short)
+        found = measure_node_excess(self._system, self._state.nodes, self._expected, share)
         return max(float(found[0]), self._left), int(found[1])
 
 
@@ -211,14 +208,12 @@ def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.ve
 
 
 @kernel
-def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32, is_short: ti.template()):
+def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32):
     """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
 
     Damping adds tau times the rate at which the prediction strains.
     """
     cells, mesh, frames, work = ti.static((system.cells, system.mesh, system.frames, system.work))
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for s in range(system.count):
         start_u = derivative(cells.along, cells, nodes, carry, s, TRIANGLE)
         start_v = derivative(cells.across, cells, nodes, carry, s, TRIANGLE)
@@ -243,13 +238,9 @@ def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32, 
         lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
         pull = ROOT_HALF * cells.law[s][1] * shear_of(start_u, start_v)[0]
         frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(system.own):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
         work.start_mean[mesh.node[k]] = mean_strain(k, mesh, frames.start)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for s in range(system.count):
         tension = tension_of(s, cells, mesh, frames.start, work.start_mean)
         frames.turning[s] = ti.max(frames.turning[s] * ti.math.vec4(tension, 1.0, 1.0), 0.0)
@@ -258,23 +249,15 @@ def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32, 
 
 
 @func
-def multiply(system: TriangleSystem, nodes: Nodes, dt: ti.f32, product: Vectors, is_short: ti.template()):
+def multiply(system: TriangleSystem, nodes: Nodes, dt: ti.f32, product: Vectors):
     """(M + dt² K) z of all nodes that are not held, else 0; for the outermost level of a kernel."""
     mesh, work = ti.static((system.mesh, system.work))
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for s in range(system.count):
         mesh.strain[s] = strain(s, system, work.z, 1.0 / dt)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(system.own):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for s in range(system.count):
         stretch(s, system, 1.0 / dt)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(system.own):
         i = mesh.node[k]
         w_i = nodes.inverse_mass[i]
@@ -310,14 +293,11 @@ def begin_iteration(
     dt: ti.f32,
     is_first: ti.i32,
     share: Share,
-    is_short: ti.template(),
 ):
     """Residual at the start, and inverse blocks; in the first solve of a step the start is a multiple of `elastic`, and
     that is 0 from there on.
     """
     tree, mesh, work = ti.static((share.tree, system.mesh, system.work))
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(system.own):
         i = mesh.node[k]
         w_i = nodes.inverse_mass[i]
@@ -334,10 +314,8 @@ def begin_iteration(
         work.r[i] = r_i
         work.z[i] = ti.select(is_first, e_i, 0.0)
         elastic[i] = ti.select(is_first, 0.0, e_i)
-    multiply(system, nodes, dt, work.q, is_short)
+    multiply(system, nodes, dt, work.q)
     sum_products(system, work.q, share)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(system.own):
         i = mesh.node[k]
         work_done, energy = tree.nodes[0], tree.nodes[tree.lanes // BRANCHES]
@@ -352,7 +330,7 @@ def begin_iteration(
 
 
 @kernel
-def iterate(system: TriangleSystem, nodes: Nodes, dt: ti.f32, first: ti.i32, share: Share, is_short: ti.template()):
+def iterate(system: TriangleSystem, nodes: Nodes, dt: ti.f32, first: ti.i32, share: Share):
     """`ITERATIONS_AT_ONCE` iterations, from number `first` on: with z = B r, gamma = r.z, delta = z.A z,
 
     beta = gamma/gamma', alpha = gamma/(delta - beta gamma/alpha'), p = z + beta p, q = A z + beta q,
@@ -360,10 +338,8 @@ def iterate(system: TriangleSystem, nodes: Nodes, dt: ti.f32, first: ti.i32, sha
     """
     tree, work = ti.static((share.tree, system.work))
     for step in ti.static(range(ITERATIONS_AT_ONCE)):
-        multiply(system, nodes, dt, work.a_z, is_short)
+        multiply(system, nodes, dt, work.a_z)
         sum_products(system, work.a_z, share)
-        if ti.static(is_short):
-            ti.loop_config(serialize=True)
         for k in range(system.own):
             i = system.mesh.node[k]
             gamma, delta = tree.nodes[0], tree.nodes[tree.lanes // BRANCHES]
@@ -400,31 +376,23 @@ def decrease(scalars: Floats, first: ti.i32, end: ti.i32) -> ti.math.vec2:
 
 
 @func
-def measure_displaced(system: TriangleSystem, nodes: Nodes, is_short: ti.template()):
+def measure_displaced(system: TriangleSystem, nodes: Nodes):
     """Strains of triangles, then of nodes, where displacements lead; for the outermost level of a kernel."""
     cells, mesh = ti.static((system.cells, system.mesh))
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for s in range(system.count):
         d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
         d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
         mesh.strain[s] = ti.math.vec2(d_u.norm() - 1.0, d_v.norm() - 1.0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(system.own):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
 
 
 @kernel
-def finish_iteration(
-    system: TriangleSystem, nodes: Nodes, elastic: Vectors, expected: Strains, is_short: ti.template()
-):
+def finish_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, expected: Strains):
     """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
     nodes are expected to have then.
     """
     mesh, work = ti.static((system.mesh, system.work))
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for chunk in range(system.chunks):
         moment, mass = ti.math.vec3(0.0), 0.0
         for k in range(mesh.chunk[chunk], mesh.chunk[chunk + 1]):
@@ -436,37 +404,29 @@ def finish_iteration(
             moment += m_i * work.x[i]
             mass += m_i
         work.moment[chunk] = ti.math.vec4(moment, mass)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for piece in range(system.pieces):
         total = ti.math.vec4(0.0)
         for chunk in range(mesh.first_chunk[piece], mesh.first_chunk[piece + 1]):
             total += work.moment[chunk]
         work.shift[piece] = ti.select(total[3] < HELD, total.xyz / total[3], 0.0)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
     for k in range(system.own):
         i = mesh.node[k]
         if nodes.inverse_mass[i] > 0.0:
             x_i = work.x[i] - work.shift[mesh.piece[k]]
             elastic[i] = elastic[i] + x_i
             nodes.displacement[i] = nodes.displacement[i] + x_i
-    measure_displaced(system, nodes, is_short)
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
+    measure_displaced(system, nodes)
     for k in range(system.own):
         expected[mesh.node[k]] = mesh.mean[mesh.node[k]]
 
 
 @kernel
-def measure_node_excess(
-    system: TriangleSystem, nodes: Nodes, expected: Strains, share: Share, is_short: ti.template()
-) -> Results:
+def measure_node_excess(system: TriangleSystem, nodes: Nodes, expected: Strains, share: Share) -> Results:
     """Largest excess of strain of nodes of triangles, as `spring_convergence` has it, and how many along warp and weft
     are beyond `LARGEST_RESIDUAL`.
     """
     tree, mesh = ti.static((share.tree, system.mesh))
-    measure_displaced(system, nodes, is_short)
+    measure_displaced(system, nodes)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(tree.lanes):

@@ -41,7 +41,7 @@ ANSWERED = 3
 """Exit code of a probe that has found why its device does not work; Python's own for any error is 1."""
 
 _in_use: dict[str, Any] = {}
-"""Back end and thread count of this process once `initialize` has run."""
+"""Back end and thread count of this process once `initialize` has run; why loops are slow, if they are."""
 
 
 class DeviceUnavailableError(RuntimeError):
@@ -72,7 +72,7 @@ def initialize(device: Device = "auto", *, threads: int | None = None, gpu: int 
         DeviceUnavailableError: that device does not work here, or Taichi itself does not load.
         RuntimeError: Taichi runs already on another device or with another number of threads.
     """
-    if _in_use:
+    if "device" in _in_use:
         running, its_threads = _in_use["device"], _in_use["threads"]
         if device not in ("auto", running) or threads not in (None, its_threads):
             raise RuntimeError(
@@ -89,6 +89,11 @@ def initialize(device: Device = "auto", *, threads: int | None = None, gpu: int 
     _start_taichi(backend, thread_count)
     _in_use.update(device=backend, threads=thread_count)
     return backend
+
+
+def slow_loops() -> str:
+    """Why Taichi's own threads do the loops of kernels on this CPU, which is slower; empty where ours do."""
+    return str(_in_use.get("slow_loops", ""))
 
 
 def resolve_device(device: Device) -> str:
@@ -178,6 +183,13 @@ def _start_taichi(device: str, threads: int) -> None:
             random_seed=0,
         )
     free_in_this_thread()
+    if device == "cpu":
+        from sim.core.thread_pool import take_over
+
+        try:
+            take_over(threads)
+        except (OSError, RuntimeError) as reason:
+            _in_use["slow_loops"] = str(reason)
 
 
 def _unwrapped_position(context: Any, node: ast.expr | ast.stmt) -> str:

@@ -1,9 +1,5 @@
 """Division of the loops of kernels among the threads of a CPU.
 
-Short loops stay on the thread that launches them: to give a loop to threads and wait for them costs some 50 us. Which
-loops are short depends on the device and on sizes, never on the number of threads: compiled either way, a loop may
-differ in its last bits. On a GPU no loop is short, as a serial one would have one thread.
-
 Loops whose items differ much in work are shared out while they run. Taichi cuts a loop into one run of neighbouring
 items for each thread, of 512 at least, and waits for the thread with the heaviest run. Here a kernel loops over workers
 instead, enough for every thread to have one, and every worker takes the next few items that nobody has taken:
@@ -25,14 +21,8 @@ from taichi.lang import impl
 from sim.core.arrays import Integers
 from sim.core.reductions import runs_on_gpu
 
-LONGEST_NS = 250_000.0  # work of a loop up to which waking two threads costs more than they save: an estimate
 LEAST_RUN = 512  # fewest items of a loop that Taichi gives to a thread of a CPU, where there are so many
 NO_MORE = 2**31 - 1  # number of the item after the last
-
-
-def is_short(items: int, item_ns: float) -> bool:
-    """Whether a loop over so many items, of about so much work each [ns], is better left to one thread."""
-    return not runs_on_gpu() and bool(items * item_ns <= LONGEST_NS)
 
 
 def workers_for(count: int) -> int:

@@ -17,7 +17,6 @@ from sim.core.arrays import Floats, Integers
 from sim.core.bundles import bundle, func
 from sim.core.host_access import put
 from sim.core.launch import kernel
-from sim.core.scheduling import is_short
 from sim.smoke.arrays import new_floats
 from sim.smoke.lanes import (
     RUN,
@@ -37,7 +36,7 @@ SMOOTHED_SPECTRUM = (0.4, 2.0)
 """Eigenvalues of D^-1 A that the smoother has to damp: 2 is the largest that a stencil of this kind has; modes below
 1/3 to 1/2 are smooth enough for the coarse grid. The lower end was chosen by counting iterations."""
 
-CELL_NS = 2.5  # work of one loop over a level a cell [ns], roughly
+FEW_CELLS = 4096  # of a level that one thread of a CPU has done before the host has launched a loop for all
 
 
 def chebyshev_weights(count: int, spectrum: tuple[float, float]) -> tuple[float, ...]:
@@ -73,10 +72,8 @@ class MultigridVCycle:
         self.coefficients = Coefficients(obstacles)
         levels = self.coefficients.levels
         total = sum(level.size for level in levels)
-        # From this one on by one thread; the coarsest always is, on a CPU.
-        self._first_short = next(
-            (n for n, level in enumerate(levels) if is_short(math.prod(level.cells), CELL_NS)), None
-        )
+        # From the first small one on by one thread; the coarsest always is, on a CPU.
+        self._large = sum(math.prod(level.cells) > FEW_CELLS for level in levels)
         self._grids = ti.ndarray(ti.i32, 4 * len(levels))
         self._grids.from_numpy(np.array([(level.offset, *level.cells) for level in levels], np.int32).ravel())
         coarsest_count = math.prod(levels[-1].cells)
@@ -104,7 +101,7 @@ class MultigridVCycle:
         if boxes[0].lanes > 1:
             _cycle(self.equation, self._grids, len(boxes), boxes[0].lanes)
             return
-        descents = list(pairwise(boxes))[: self._first_short]
+        descents = list(pairwise(boxes))[: self._large]
         for fine, coarse in descents:
             _descend(self.equation, fine, coarse)
         _cycle_short(self.equation, self._grids, len(descents), len(boxes) - 1)

@@ -21,7 +21,6 @@ from thread_counts import result_on_any_threads
 
 from sim.cloth.cells import Cells, cells_of
 from sim.cloth.sheet import sheet_of_triangles
-from sim.core import scheduling
 from validation.sheet_energy import cell_energies
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -118,13 +117,11 @@ def test_a_continued_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
 
 
 def places(path: str) -> list[float]:
-    """Where some nodes of a mesh get, all loops being shared out."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scheduling, "LONGEST_NS", 0.0)
-        solver = solver_of(cloth(shape={"type": "mesh", "file": path, "up": "z"}, pin=[{"index": [0, 1]}]))
-        advance(solver, 0.02)
-        found: list[float] = solver.state.positions()[::50].ravel().tolist()
-        return found
+    """Where some nodes of a mesh get."""
+    solver = solver_of(cloth(shape={"type": "mesh", "file": path, "up": "z"}, pin=[{"index": [0, 1]}]))
+    advance(solver, 0.02)
+    found: list[float] = solver.state.positions()[::50].ravel().tolist()
+    return found
 
 
 def test_meshes_do_not_depend_on_the_number_of_threads(tmp_path):

@@ -3,7 +3,6 @@ import pytest
 import taichi as ti
 from thread_counts import result_on_threads
 
-from sim.core import scheduling
 from sim.core.arrays import Integers
 from sim.core.scheduling import begin_sharing, next_item, workers_for
 
@@ -63,12 +62,3 @@ def marks_of_a_meeting() -> list[int]:
 def test_two_items_are_done_at_the_same_time_by_two_threads():
     """Taichi by itself gives a thread 512 items at least, so that one thread would have both, one after the other."""
     assert result_on_threads(2, marks_of_a_meeting) == [1, 1, 2]
-
-
-def test_a_loop_is_short_by_its_work_and_never_on_a_gpu(monkeypatch):
-    items = int(scheduling.LONGEST_NS / 10.0)
-    monkeypatch.setattr(scheduling, "runs_on_gpu", lambda: False)
-    assert scheduling.is_short(items, 10.0)
-    assert not scheduling.is_short(items + 1, 10.0)
-    monkeypatch.setattr(scheduling, "runs_on_gpu", lambda: True)
-    assert not scheduling.is_short(1, 1.0)

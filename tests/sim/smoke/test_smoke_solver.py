@@ -5,10 +5,10 @@ import pytest
 from smoke_scenes import OPEN_BOX, Bytes
 from thread_counts import digest_of, result_on_any_threads
 
-from sim.core import scheduling
 from sim.core.domain import DomainParameters
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
+from sim.smoke import multigrid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
@@ -262,9 +262,9 @@ def test_a_plain_box_takes_less_than_120_bytes_a_cell(monkeypatch):
 def digests_of_plumes() -> list[str]:
     """Of a plume in gusts as a small grid, and as a large one, whose coarse levels one thread computes."""
     found = []
-    for longest_ns in (scheduling.LONGEST_NS, 2.0e4):
+    for few_cells in (multigrid.FEW_CELLS, 500):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(scheduling, "LONGEST_NS", longest_ns)
+            patch.setattr(multigrid, "FEW_CELLS", few_cells)
             solver = build_plume(wind=(0.5, 0.2, 0.0), turbulence={"strength": 2.0, "size": 0.2, "rate": 4.0})
             advance(solver, 6)
         found.append(digest_of(solver.checkpoint()))
