@@ -31,6 +31,7 @@ class CollisionDetector:
 
     Attributes:
         followed: the contacts that are being followed, by pair.
+        untouching: keys of pairs of bodies that do not touch each other, as joints hold them, ascending.
 
     Raises:
         ValueError: there are too many bodies for the keys of contacts.
@@ -47,6 +48,14 @@ class CollisionDetector:
         self._size = np.array([*(geometry.shortest_edge for geometry in geometries), np.inf])
         self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.followed = AnchoredContacts.joined([])
+        self.untouching = np.zeros(0, dtype=np.int64)
+
+    def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
+        """Those of some pairs of bodies, the lower number first, that may touch, (p,) each."""
+        if not len(self.untouching):
+            return first, second
+        may = ~rows_of(pair_keys(first, second), self.untouching)[1]
+        return first[may], second[may]
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The contacts that are being followed: bodies that rest on others than before would tremble."""
@@ -158,7 +167,7 @@ class CollisionDetector:
     ) -> tuple[Indices, Indices, Indices]:
         """Pairs whose boxes are within their margins, and the wall that is meant, or -1: (k,) each, by pair."""
         reach = ((CONTACT_BAND + TRUSTED_MOTION) * self._size[:-1] + motion[:-1])[:, None]
-        first, second = overlapping_pairs(lower - reach, upper + reach, is_active)
+        first, second = self.touching(*overlapping_pairs(lower - reach, upper + reach, is_active))
         apart = np.maximum(lower[first] - upper[second], lower[second] - upper[first]).max(axis=1)
         near = apart <= self._margin(first, second, motion)
         pairs = [(first[near], second[near], np.full(np.count_nonzero(near), -1))]

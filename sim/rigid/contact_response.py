@@ -9,8 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
-from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_positions, solve_velocities
+from sim.rigid.contact_solver import (
+    NO_IMPULSES,
+    NO_LINKS,
+    RELATIVE_TOLERANCE,
+    ContactSystem,
+    Solution,
+    solve_positions,
+    solve_velocities,
+)
 from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
+from sim.rigid.joint_system import solve_alone
+from sim.rigid.joints import Joints, JointStep
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
@@ -46,6 +56,7 @@ class Outcome:
     is_held: NDArray[np.bool_]  # bodies that got one from what cannot move, (n,) bool
     iterations: int  # sweeps of the solver
     converged: bool  # whether it converged
+    joint_impulses: Array  # of the joints, (r,), if there are any
 
 
 class ContactResponse:
@@ -59,10 +70,20 @@ class ContactResponse:
         self._surfaces, self._gravity = surfaces, gravity
         self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
-    def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float, is_active: NDArray[np.bool_]) -> Outcome:
+    def resolve(
+        self,
+        contacts: Contacts,
+        bodies: MovingBodies,
+        dt: float,
+        is_active: NDArray[np.bool_],
+        inverse_inertia: Array,
+        joints: Joints | None = None,
+        step: JointStep | None = None,
+    ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
-        These are all their contacts; what is known of those of other bodies stays.
+        These are all their contacts; what is known of those of other bodies stays. Inverse inertia tensors are in world
+        axes, (n, 3, 3); joints, with their step, hold where contacts are.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
@@ -70,14 +91,27 @@ class ContactResponse:
         if not len(contacts):
             self._replace(contacts.keys, np.zeros((0, 3)), is_active)
             nobody = np.zeros(n, dtype=bool)
-            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody, 0, True)
+            still = np.zeros(0 if step is None else len(step.values))
+            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), 0, True, still)
         inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
-        system = ContactSystem.build(contacts, bodies.position, inverse_mass, bodies.inverse_inertia())
+        links = NO_LINKS if step is None else step.system.links()
+        system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
         velocity = np.concatenate([bodies.velocity, bodies.angular_velocity], axis=1)
-        impacts, bounces = self._bounce(contacts, bodies, system, velocity, friction, restitution, least_normal, dt)
+        held = NO_IMPULSES
+        if joints is not None and step is not None:
+            # Impacts are of bodies that the joints hold already.
+            alone = solve_alone(joints.impacts(step, velocity))
+            velocity, held = velocity + alone.change, alone.impulses
+        impacts, bounces = self._bounce(
+            contacts, bodies, system, velocity, friction, restitution, least_normal, dt, joints, step
+        )
         free = system.velocities(velocity + impacts.change)
+        demand = None
+        if joints is not None and step is not None:
+            held = held + impacts.joint_impulses
+            demand = joints.velocities(step, velocity + impacts.change)
         solution = solve_velocities(
             system,
             free,
@@ -85,6 +119,7 @@ class ContactResponse:
             friction=friction,
             start=self._starting_impulses(contacts, system, dt),
             tolerance=self._tolerance(system, free, dt),
+            joints=demand,
         )
         velocity = velocity + impacts.change + solution.change
         bodies.velocity, bodies.angular_velocity = velocity[:, :3], velocity[:, 3:]
@@ -93,18 +128,19 @@ class ContactResponse:
 
         normal_velocity = system.velocities(velocity)[:, 0]
         separation = self._separate(contacts, system, bounces, normal_velocity, dt)
-        touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
+        touched, is_held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
         pushed = (solution.impulses[:, 0] > 0.0) | (impacts.impulses[:, 0] > 0.0)
         for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
             touched[np.minimum(body[pushed], n)] = True
-            held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
+            is_held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
         return Outcome(
             separation.change[:, :3],
             separation.change[:, 3:],
             touched[:n],
-            held[:n],
+            is_held[:n],
             impacts.iterations + solution.iterations + separation.iterations,
             impacts.converged and solution.converged and separation.converged,
+            held + solution.joint_impulses,
         )
 
     def _bounce(
@@ -117,6 +153,8 @@ class ContactResponse:
         restitution: Array,
         least_normal: Array,
         dt: float,
+        joints: Joints | None,
+        step: JointStep | None,
     ) -> tuple[Solution, Bounces]:
         """The impacts of a step in rounds: a blow goes through bodies that touch, or nearly, one after the other.
 
@@ -128,6 +166,7 @@ class ContactResponse:
         k = len(contacts)
         impulses, change, bounces = np.zeros((k, 3)), np.zeros((system.body_count, 6)), Bounces.none(k)
         iterations, converged = 0, True
+        by_joints = NO_IMPULSES if step is None else np.zeros(len(step.values))
         for rounds in range(MOST_ROUNDS + 1):
             found = Bounces.find(
                 contacts,
@@ -155,11 +194,13 @@ class ContactResponse:
                 least_normal=least_normal[rows],
                 friction=friction[rows],
                 tolerance=self._tolerance(part, free, dt),
+                joints=None if joints is None or step is None else joints.impacts(step, velocity + change),
             )
+            by_joints = by_joints + solution.joint_impulses
             impulses[rows] += solution.impulses
             change += solution.change
             iterations, converged = iterations + solution.iterations, converged and solution.converged
-        return Solution(impulses, change, iterations, converged), bounces
+        return Solution(impulses, change, iterations, converged, by_joints), bounces
 
     def _tolerance(self, system: ContactSystem, free: Array, dt: float) -> Array:
         """What a sweep over each island may still change when it is the last [m/s], (islands,)."""
@@ -203,7 +244,7 @@ class ContactResponse:
         """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
         overlap = -contacts.gap - SLOP
         if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
-            return Solution(np.zeros((len(contacts), 3)), np.zeros((system.body_count, 6)), 0, True)
+            return Solution(np.zeros((len(contacts), 3)), np.zeros((system.body_count, 6)), 0, True, NO_IMPULSES)
         rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
         # Contacts that do not overlap may close by what the velocities leave of their gaps.
         wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)

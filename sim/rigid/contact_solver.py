@@ -11,9 +11,10 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.rotation import cross
 from sim.rigid.contacts import Array, Contacts, Indices
+from sim.rigid.joint_system import UNBOUNDED, JointDemand
 
 MAX_ITERATIONS = 100
-LARGEST_IMPULSE = 1.0e300  # [N s]: kernels know no infinity
+NO_LINKS, NO_IMPULSES = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 
@@ -23,7 +24,7 @@ class ContactSystem:
 
     Contact i has three rows: the normal and two tangents. With the Jacobian J, mass matrix M and impulses λ the
     velocities at the contacts are w = A λ + b, A = J M⁻¹ Jᵀ, b = J v. A contact knows two bodies, so that A is sparse;
-    it is never formed. Impulses in one island do not change velocities in another.
+    it is never formed. Impulses in one island do not change velocities in another, through joints either.
     """
 
     axes: Array  # normal and tangents, (k, 3, 3)
@@ -34,9 +35,12 @@ class ContactSystem:
     own: Array  # the contact's own block of A: nn, n1, n2, 11, 12, 22, (k, 6)
     islands: Indices  # numbers of the groups of contacts that hang together, (k,)
     body_count: int  # n
+    links: Indices  # pairs of bodies that joints link, (l, 2)
 
     @classmethod
-    def build(cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array) -> ContactSystem:
+    def build(
+        cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array, links: Indices = NO_LINKS
+    ) -> ContactSystem:
         """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
         k, n = len(contacts), len(position)
         axes = np.concatenate([contacts.normal[:, None], tangent_basis(contacts.normal)], axis=1)
@@ -55,7 +59,7 @@ class ContactSystem:
         blocks = np.einsum("ksci,ksdi->kcd", jacobian, response)
         own = np.ascontiguousarray(blocks[:, *np.triu_indices(3)])
         movers = np.where(moves, bodies, -1).astype(np.int32)
-        return cls(axes, bodies, movers, jacobian, response, own, _islands(movers, n), n)
+        return cls(axes, bodies, movers, jacobian, response, own, _islands(movers, n, links), n, links)
 
     def chosen(self, rows: Indices) -> ContactSystem:
         """The system of some of the contacts."""
@@ -67,8 +71,9 @@ class ContactSystem:
             self.jacobian[rows],
             self.response[rows],
             self.own[rows],
-            _islands(movers, self.body_count),
+            _islands(movers, self.body_count, self.links),
             self.body_count,
+            self.links,
         )
 
     def velocities(self, of_bodies: Array) -> Array:
@@ -91,10 +96,18 @@ class Solution:
     change: Array  # of the velocities (v, omega) of the moving bodies by them, (n, 6)
     iterations: int  # sweeps over all contacts of the island that took most
     converged: bool  # whether the last sweep changed less than the tolerance, in all islands
+    joint_impulses: Array  # those of joints, (r,), or none where these ask nothing
 
 
 def solve_velocities(
-    system: ContactSystem, free: Array, *, least_normal: Array, friction: Array, start: Array, tolerance: Array
+    system: ContactSystem,
+    free: Array,
+    *,
+    least_normal: Array,
+    friction: Array,
+    start: Array,
+    tolerance: Array,
+    joints: JointDemand | None = None,
 ) -> Solution:
     """Impulses with w_n >= least_normal, λ_n >= 0, complementary, and Coulomb friction |λ_t| <= mu λ_n.
 
@@ -109,10 +122,11 @@ def solve_velocities(
         friction: coefficients mu [-], (k,).
         start: impulses to start from [N s], (k, 3).
         tolerance: largest change of a contact velocity in the last sweep of each island [m/s], (islands,).
+        joints: what joints ask, of which those in islands with contacts are solved.
     """
     bias = free.copy()
     bias[:, 0] -= least_normal
-    return _sweep(system, bias, np.zeros(len(free)), friction, _admissible(start, friction), tolerance)
+    return _sweep(system, bias, np.zeros(len(free)), friction, _admissible(start, friction), tolerance, joints)
 
 
 def solve_positions(
@@ -129,7 +143,7 @@ def solve_positions(
     k = len(wanted)
     bias = np.zeros((k, 3))
     bias[:, 0] = -wanted
-    return _sweep(system, bias, np.where(two_sided, -LARGEST_IMPULSE, 0.0), np.zeros(k), np.zeros((k, 3)), tolerance)
+    return _sweep(system, bias, np.where(two_sided, -UNBOUNDED, 0.0), np.zeros(k), np.zeros((k, 3)), tolerance)
 
 
 def tangent_basis(normal: Array) -> Array:
@@ -145,45 +159,67 @@ def tangent_basis(normal: Array) -> Array:
 
 
 def _sweep(
-    system: ContactSystem, bias: Array, lowest: Array, friction: Array, impulses: Array, tolerance: Array
+    system: ContactSystem,
+    bias: Array,
+    lowest: Array,
+    friction: Array,
+    impulses: Array,
+    tolerance: Array,
+    joints: JointDemand | None = None,
 ) -> Solution:
     """Impulses from those given on, which are overwritten."""
-    from sim.rigid.contact_kernels import System, sweep_islands
+    from sim.rigid.contact_kernels import System, sweep_islands, sweep_jointed_islands
+    from sim.rigid.joint_kernels import IMPULSE
 
     k = len(bias)
     order = np.argsort(system.islands, kind="stable").astype(np.int32)
     first = np.concatenate([[0], np.cumsum(np.bincount(system.islands))]).astype(np.int32)
     change, sweeps = np.zeros((system.body_count, 6)), np.zeros(len(first) - 1, dtype=np.int32)
-    sweep_islands(
-        order,
-        first,
-        System(
-            system.movers,
-            system.jacobian.reshape(k, 36),
-            system.response.reshape(k, 36),
-            system.own,
-            bias,
-            lowest,
-            friction,
-        ),
-        tolerance,
-        MAX_ITERATIONS,
-        impulses,
-        change,
-        np.empty((k, 6)),
-        sweeps,
+    contacts = System(
+        system.movers,
+        system.jacobian.reshape(k, 36),
+        system.response.reshape(k, 36),
+        system.own,
+        bias,
+        lowest,
+        friction,
     )
+    found = (tolerance, MAX_ITERATIONS, impulses, change, np.empty((k, 6)), sweeps)
+    by_joints = NO_IMPULSES
+    if joints is None:
+        sweep_islands(order, first, contacts, *found)
+    else:
+        rows = joints.rows()
+        sweep_jointed_islands(order, first, contacts, *_joints_of_islands(system, joints), rows, *found)
+        by_joints = rows.numbers[:, IMPULSE].copy()
     most = int(sweeps.max())
-    return Solution(impulses, change, min(most, MAX_ITERATIONS), most <= MAX_ITERATIONS)
+    return Solution(impulses, change, min(most, MAX_ITERATIONS), most <= MAX_ITERATIONS, by_joints)
 
 
-def _islands(movers: NDArray[np.int32], n: int) -> Indices:
-    """Numbers of the groups of contacts, (k,), that bodies which impulses move link."""
-    linking = (movers >= 0).all(axis=1)
-    first, second = movers[linking].T
-    links = coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(n, n))
-    group = connected_components(links, directed=False)[1]
-    return np.unique(group[movers.max(axis=1)], return_inverse=True)[1].astype(np.int64)
+def _islands(movers: NDArray[np.int32], n: int, links: Indices) -> Indices:
+    """Numbers of the groups of contacts, (k,), that joints and bodies which impulses move link."""
+    return np.unique(_groups(movers, n, links)[movers.max(axis=1)], return_inverse=True)[1].astype(np.int64)
+
+
+def _groups(movers: NDArray[np.int32], n: int, links: Indices) -> Indices:
+    """Number of the group of each body, (n,), that contacts and joints link."""
+    first, second = np.concatenate([movers[(movers >= 0).all(axis=1)], links]).T
+    linked = coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(n, n))
+    return connected_components(linked, directed=False)[1].astype(np.int64)
+
+
+def _joints_of_islands(system: ContactSystem, joints: JointDemand) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Components of joints, island after island, and where those of each island begin; others are left out."""
+    groups = _groups(system.movers, system.body_count, system.links)
+    island_of = np.full(system.body_count, -1)
+    island_of[groups[system.movers.max(axis=1)]] = system.islands
+    components, movers = joints.system.elimination.component, joints.system.movers.max(axis=1)
+    island = np.full(len(joints.system.elimination.components), -1)
+    moved = movers >= 0
+    island[components[moved]] = island_of[groups[movers[moved]]]
+    order = np.argsort(island, kind="stable").astype(np.int32)
+    first = np.searchsorted(island[order], np.arange(int(system.islands.max()) + 2)).astype(np.int32)
+    return order, first
 
 
 def _admissible(impulses: Array, friction: Array) -> Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
 from sim.rigid.contacts import Array, Contacts, Indices
+from sim.rigid.joint_system import JointDemand
 from sim.rigid.states import MovingBodies
 
 SLOWEST_BOUNCE = 0.02  # approach below which nothing bounces [m/s]; or two steps of gravity
@@ -98,6 +99,7 @@ def solve_impacts(
     least_normal: Array,
     friction: Array,
     tolerance: Array,
+    joints: JointDemand | None = None,
 ) -> Solution:
     """Impulses with Newton's restitution, as far as energy allows; arguments as those of `solve_velocities`.
 
@@ -112,9 +114,9 @@ def solve_impacts(
 
     λ is between two solutions: it pushes only, stays within friction and lets nothing approach, which are all convex.
     Without friction E(1) is just the bound, as it is for all central impacts, so that Newton's law holds there. Each
-    group of bodies that touch has its own s.
+    group of bodies that touch has its own s. Joints, which do no work, hold throughout.
     """
-    solve = partial(solve_velocities, system, free, friction=friction, tolerance=tolerance)
+    solve = partial(solve_velocities, system, free, friction=friction, tolerance=tolerance, joints=joints)
     nothing = np.zeros_like(free)
     compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=nothing)
     before = compression.impulses
@@ -145,12 +147,34 @@ def solve_impacts(
     for side in range(2):
         moves = system.movers[:, side] >= 0
         share_of_bodies[system.movers[moves, side]] = share[islands[moves]]
+    by_joints = compression.joint_impulses
+    if joints is not None:
+        share_of_bodies, share_of_rows = _shares_with_joints(share_of_bodies, joints)
+        by_joints = by_joints + share_of_rows * (newton.joint_impulses - by_joints)
     return Solution(
         before + share[islands][:, None] * step,
         compression.change + share_of_bodies[:, None] * change_of_bodies,
         compression.iterations + newton.iterations,
         compression.converged and newton.converged,
+        by_joints,
     )
+
+
+def _shares_with_joints(share_of_bodies: Array, joints: JointDemand) -> tuple[Array, Array]:
+    """The shares of bodies, (n,), with those that joints alone move, and the shares of rows of joints, (r,).
+
+    All bodies of a component of joints are of one island, and at least one of those that contacts move knows its share.
+    """
+    movers, component = joints.system.movers, joints.system.elimination.component
+    of_components = np.zeros(len(joints.system.elimination.components))
+    for side in range(2):
+        moves = movers[:, side] >= 0
+        np.maximum.at(of_components, component[moves], share_of_bodies[movers[moves, side]])
+    shares = share_of_bodies.copy()
+    for side in range(2):
+        moves = movers[:, side] >= 0
+        shares[movers[moves, side]] = of_components[component[moves]]
+    return shares, of_components[component]
 
 
 def _largest_share(room: float, linear: float, quadratic: float) -> float:

@@ -38,7 +38,11 @@ class Meetings:
 
 
 class StepChooser:
-    """How long steps of bodies may be; gravity is in m/s²."""
+    """How long steps of bodies may be; gravity is in m/s².
+
+    Attributes:
+        links: pairs of moving bodies that joints hold together, (l,) each: they take the same steps.
+    """
 
     def __init__(
         self,
@@ -55,6 +59,7 @@ class StepChooser:
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
         self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
+        self.links = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
     def meetings(self, poses: Poses, dt: float, is_active: NDArray[np.bool_], speeds: Array | None = None) -> Meetings:
         """The meetings of active bodies, (n,), within dt [s]; speeds of surfaces [m/s], (n,), their own if omitted."""
@@ -67,7 +72,7 @@ class StepChooser:
         reach = (motion + (CONTACT_BAND + TRUSTED_MOTION) * self._edge)[:, None]
         lower, upper = self._detector.boxes(poses)
         among = np.append(is_active, np.zeros(len(self._edge) - n, dtype=bool))
-        first, second = overlapping_pairs(lower - reach, upper + reach, among)
+        first, second = self._detector.touching(*overlapping_pairs(lower - reach, upper + reach, among))
 
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
         turning = np.append(spin, np.zeros(len(self._edge) - n)) * self._radius
@@ -128,8 +133,11 @@ class StepChooser:
         """The group of each body, and how many steps it takes in dt [s], (n,) each."""
         n = len(is_free)
         free = np.append(is_free, np.zeros(len(self._edge) - n, dtype=bool))
-        links = free[meetings.first] & free[meetings.second]
-        groups = groups_of(meetings.first[links], meetings.second[links], n)
+        first, second = (
+            np.concatenate(each) for each in zip((meetings.first, meetings.second), self.links, strict=True)
+        )
+        links = free[first] & free[second]
+        groups = groups_of(first[links], second[links], n)
         time_s = np.full(n, np.inf)
         np.minimum.at(time_s, groups[is_free], meetings.alone_s[is_free])
         for one, two in ((meetings.first, meetings.second), (meetings.second, meetings.first)):
