@@ -28,6 +28,7 @@ HOLDS, LIMITS, DRIVES, PULLS = range(4)
 
 MOST_STEPS = 20  # of Newton's method to where the joints hold at the end of a step
 HELD = 1.0e-11  # error of a joint [m], [rad] at which these steps end
+APART = 1.0e-6  # error that no impulse changes: what joints ask for is more than there is to move [m], [rad]
 CLOSING_SHARE = 0.2  # of an error at the start of a step that is taken back in it
 TOUCHING = 1.0e-6  # a limit nearer than this counts as reached in an impact [m], [rad]
 REDUNDANT = 1.0e-9  # of the largest: rows of one body with smaller eigenvalues say what others say
@@ -358,7 +359,8 @@ class Joints:
             if not found.converged:
                 break
             if dt * float(np.abs(system.velocities(found.change))[system.is_there].max()) <= HELD:
-                converged = True
+                holds = system.is_there & (self._does == HOLDS)
+                converged = float(np.max(np.abs(values - wanted), initial=0.0, where=holds)) <= APART
                 break
         bodies.velocity = bodies.velocity + change[:, :3]
         bodies.angular_velocity = bodies.angular_velocity + change[:, 3:]
