@@ -55,9 +55,7 @@ class MotorParameters(Parameters):
     def _has_one_aim(self) -> Self:
         aims = [key for key in ("speed", "angle_deg", "position") if getattr(self, key) is not None]
         if len(aims) != 1:
-            raise ValueError(
-                "needs one of speed, angle_deg and position" + (f", got {', '.join(aims)}" if aims else "")
-            )
+            raise ValueError(f"needs one of speed, angle_deg and position, got {' and '.join(aims) or 'none'}")
         if "response_s" in self.model_fields_set and aims == ["speed"]:
             raise ValueError("response_s has no meaning for a speed; remove it")
         return self
@@ -199,16 +197,13 @@ def joint_problems(joints: Sequence[JointParameters], bodies: Sequence[RigidBody
             yield JointProblem(number, "name", f'"{joint.name}" is taken by joint[{names[joint.name]}]; take another')
         names.setdefault(joint.name, number)
         if unknown := [name for name in joint.between if name not in kinds]:
-            known = f"; rigid bodies are {', '.join(kinds)}" if kinds else "; add [[rigid]]"
-            yield JointProblem(
-                number, "between", f'names what is not there: no rigid body is named "{unknown[0]}"{known}'
-            )
+            known = f"rigid bodies are {', '.join(kinds)}" if kinds else "add [[rigid]]"
+            yield JointProblem(number, "between", f'names no rigid body with "{unknown[0]}"; {known}')
             continue
         if all(kinds[name] != "dynamic" for name in joint.between):
             told = " and ".join(f'"{name}" is {kinds[name]}' for name in joint.between)
-            yield JointProblem(
-                number, "between", f'cannot move: {told}, and no force moves either; make one kind = "dynamic"'
-            )
+            sentence = f'cannot move: {told}, which no force moves; make one kind = "dynamic"'
+            yield JointProblem(number, "between", sentence)
             continue
         if joint.kind in RIGID_KINDS:
             # All that stands is one; "" is the world.
