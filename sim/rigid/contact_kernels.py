@@ -11,44 +11,117 @@ Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
 Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
 Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Pairs = ti.types.ndarray(dtype=ti.i32, ndim=2)
+Vector3 = ti.types.vector(3, ti.f64)
 
 MAX_FRICTION_STEPS = 12
 FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
 
 
+NORMAL, TANGENT, ARM, OWN, BIAS, LOWEST, FRICTION, MOVER, IMPULSE, BEFORE, AHEAD = 0, 3, 9, 15, 21, 24, 25, 26, 28, 31, 34
+"""Columns of what a contact is while its island is solved: arms and movers are two, tangents of three numbers too."""
+COLUMNS = 37
+Contact = ti.types.ndarray(dtype=ti.types.vector(COLUMNS, ti.f64), ndim=1)
+Change = ti.types.ndarray(dtype=ti.types.vector(6, ti.f64), ndim=1)
+Ease = ti.types.ndarray(dtype=ti.types.vector(7, ti.f64), ndim=1)
+
+
 @bundle
 class System(NamedTuple):
-    """Contacts, (c,), and what is asked of them."""
+    """Contacts, (c,), of bodies, (n,), and what is asked of them."""
 
     movers: Pairs  # the two bodies of each, -1 where nothing moves it, (c, 2)
-    jacobian: Rows  # by body, axis and component, (c, 36)
-    response: Rows  # likewise, M⁻¹ Jᵀ
-    own: Rows  # block of A: nn, n1, n2, 11, 12, 22, (c, 6)
+    axes: Rows  # normal and two tangents, (c, 9)
+    arms: Rows  # from the centres of mass of the two bodies [m], (c, 6)
+    ease: Ease  # inverse mass [1/kg] and inertia xx, xy, xz, yy, yz, zz in world axes [1/(kg m²)], (n, 7)
     bias: Rows  # velocities without impulses, less the least normal ones [m/s], (c, 3)
     lowest: Numbers  # bounds of the normal impulses from below [N s]
     friction: Numbers  # coefficients mu [-]
 
 
-@func
-def velocity_along(i: ti.i32, row: ti.i32, system: System, change: Rows) -> ti.f64:
-    """Change of the velocity at contact i along one of its axes, by the changes of its bodies' velocities."""
-    along = ti.cast(0.0, ti.f64)
+@ti.func
+def vector_of(table: ti.template(), row: ti.i32, column: ti.i32) -> Vector3:
+    """Three numbers of a table."""
+    return Vector3(table[row][column], table[row][column + 1], table[row][column + 2])
+
+
+@ti.func
+def turned_by(ease: Ease, body: ti.i32, torque: Vector3) -> Vector3:
+    """Change of a body's angular velocity by an angular impulse."""
+    xx, xy, xz = ease[body][1], ease[body][2], ease[body][3]
+    yy, yz, zz = ease[body][4], ease[body][5], ease[body][6]
+    return Vector3(
+        xx * torque[0] + xy * torque[1] + xz * torque[2],
+        xy * torque[0] + yy * torque[1] + yz * torque[2],
+        xz * torque[0] + yz * torque[1] + zz * torque[2],
+    )
+
+
+@ti.func
+def change_at(at: ti.i32, work: Contact, change: Change) -> Vector3:
+    """Change of the relative velocity at a contact by the changes of its bodies' velocities."""
+    velocity = Vector3(0.0)
     for side in ti.static(range(2)):
-        body = system.movers[i, side]
+        body = ti.cast(work[at][MOVER + side], ti.i32)
         if body >= 0:
-            for column in range(6):
-                along += system.jacobian[i, 18 * side + 6 * row + column] * change[body, column]
-    return along
+            arm = vector_of(work, at, ARM + 3 * side)
+            own = vector_of(change, body, 0) + vector_of(change, body, 3).cross(arm)
+            velocity += own if ti.static(side == 0) else -own
+    return velocity
+
+
+@ti.func
+def push(at: ti.i32, impulse: Vector3, work: Contact, ease: Ease, change: Change):
+    """Add what an impulse at a contact changes of the velocities of its bodies."""
+    for side in ti.static(range(2)):
+        body = ti.cast(work[at][MOVER + side], ti.i32)
+        if body >= 0:
+            own = impulse if ti.static(side == 0) else -impulse
+            turn = turned_by(ease, body, vector_of(work, at, ARM + 3 * side).cross(own))
+            for axis in ti.static(range(3)):
+                change[body][axis] += ease[body][0] * own[axis]
+                change[body][3 + axis] += turn[axis]
+
+
+@ti.func
+def along_axes(at: ti.i32, first: ti.i32, work: Contact) -> Vector3:
+    """A vector in world axes of its components along the normal and the tangents, from some column on."""
+    return (
+        work[at][first] * vector_of(work, at, NORMAL)
+        + work[at][first + 1] * vector_of(work, at, TANGENT)
+        + work[at][first + 2] * vector_of(work, at, TANGENT + 3)
+    )
 
 
 @func
-def push(i: ti.i32, row: ti.i32, impulse: ti.f64, system: System, change: Rows):
-    """Add what an impulse along an axis of contact i changes of the velocities of its bodies."""
+def gather(at: ti.i32, i: ti.i32, system: System, impulses: Rows, work: Contact):
+    """Put together what a contact is, its own block of A among it: nn, n1, n2, 11, 12, 22."""
+    for column in ti.static(range(9)):
+        work[at][NORMAL + column] = system.axes[i, column]
+    for column in ti.static(range(6)):
+        work[at][ARM + column] = system.arms[i, column]
+    for column in ti.static(range(3)):
+        work[at][BIAS + column] = system.bias[i, column]
+        work[at][IMPULSE + column] = impulses[i, column]
+        work[at][AHEAD + column] = 0.0
+    work[at][LOWEST], work[at][FRICTION] = system.lowest[i], system.friction[i]
+    block = ti.Vector.zero(ti.f64, 6)
     for side in ti.static(range(2)):
         body = system.movers[i, side]
+        work[at][MOVER + side] = body
         if body >= 0:
-            for column in range(6):
-                change[body, column] += system.response[i, 18 * side + 6 * row + column] * impulse
+            arm = vector_of(work, at, ARM + 3 * side)
+            for one in ti.static(range(3)):
+                axis = vector_of(work, at, NORMAL + 3 * one)
+                answer = system.ease[body][0] * axis + turned_by(system.ease, body, arm.cross(axis)).cross(arm)
+                for two in ti.static(range(one, 3)):
+                    block[ti.static(entry_of(one, two))] += answer.dot(vector_of(work, at, NORMAL + 3 * two))
+    for entry in ti.static(range(6)):
+        work[at][OWN + entry] = block[entry]
+
+
+def entry_of(row: int, column: int) -> int:
+    """Place of an entry among those of the upper half of a symmetric matrix of three rows."""
+    return 3 * row - row * (row - 1) // 2 + column - row
 
 
 @ti.func
@@ -86,10 +159,10 @@ def sweep_islands(
     first: Whole,
     system: System,
     tolerance: Numbers,
-    most_sweeps: ti.i32,
+    most_sweeps: Whole,
     impulses: Rows,
-    change: Rows,
-    work: Rows,
+    change: Change,
+    work: Contact,
     sweeps: Whole,
 ):
     """Solve every island until a sweep changes no contact velocity by more than a tolerance.
@@ -103,67 +176,66 @@ def sweep_islands(
         first: where each island begins in `order`, and the end of the last, (islands + 1,).
         system: the contacts.
         tolerance: of each island [m/s], (islands,).
-        most_sweeps: after which an island is given up.
+        most_sweeps: after which an island is given up, (islands,).
         impulses: to start from, and found [N s], (c, 3).
         change: of the bodies' velocities by these impulses, (n, 6): nothing at first.
-        work: room for impulses before a sweep, and for directions, (c, 6).
+        work: room for what contacts are, (k, COLUMNS).
         sweeps: out: how many each island took, one more than the most where it was given up, (islands,).
     """
     for island in range(first.shape[0] - 1):
-        begin, end = first[island], first[island + 1]
+        begin, end, most = first[island], first[island + 1], most_sweeps[island]
         for at in range(begin, end):
-            for row in range(3):
-                push(order[at], row, impulses[order[at], row], system, change)
-            for row in range(3):
-                work[order[at], 3 + row] = 0.0
-        taken, square_before = most_sweeps + 1, ti.cast(0.0, ti.f64)
-        for sweep in range(most_sweeps):
+            gather(at, order[at], system, impulses, work)
+            push(at, along_axes(at, IMPULSE, work), work, system.ease, change)
+        taken, square_before = most + 1, ti.cast(0.0, ti.f64)
+        for sweep in range(most):
             largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-            for at in range(begin, end):
-                for row in range(3):
-                    work[order[at], row] = impulses[order[at], row]
-            for at in range(begin, end):
+            for step in range(begin, end):
                 # There and back: supports are seen from the ground up, and loads from the top down.
-                i = order[ti.select(sweep % 2 == 0, at, begin + end - 1 - at)]
-                old_n = impulses[i, 0]
-                w_n = system.bias[i, 0] + velocity_along(i, 0, system, change)
-                new_n = ti.max(old_n - w_n / system.own[i, 0], system.lowest[i])
-                rubs = impulses[i, 1] != 0.0 or impulses[i, 2] != 0.0
-                if new_n != 0.0 or old_n != 0.0 or rubs:
-                    push(i, 0, new_n - old_n, system, change)
-                    impulses[i, 0] = new_n
-                    largest = ti.max(largest, system.own[i, 0] * ti.abs(new_n - old_n))
-                    if system.friction[i] > 0.0:
-                        old_1, old_2 = impulses[i, 1], impulses[i, 2]
+                at = ti.select(sweep % 2 == 0, step, begin + end - 1 - step)
+                old_n, old_1, old_2 = work[at][IMPULSE], work[at][IMPULSE + 1], work[at][IMPULSE + 2]
+                work[at][BEFORE], work[at][BEFORE + 1], work[at][BEFORE + 2] = old_n, old_1, old_2
+                velocity = change_at(at, work, change)
+                w_n = work[at][BIAS] + velocity.dot(vector_of(work, at, NORMAL))
+                new_n = ti.max(old_n - w_n / work[at][OWN], work[at][LOWEST])
+                if new_n != 0.0 or old_n != 0.0 or old_1 != 0.0 or old_2 != 0.0:
+                    d_n, d_1, d_2 = new_n - old_n, ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+                    largest = ti.max(largest, work[at][OWN] * ti.abs(d_n))
+                    if work[at][FRICTION] > 0.0:
                         # Slip without the tangential impulses of this contact.
-                        c_1 = system.bias[i, 1] + velocity_along(i, 1, system, change)
-                        c_2 = system.bias[i, 2] + velocity_along(i, 2, system, change)
-                        a_11, a_12, a_22 = system.own[i, 3], system.own[i, 4], system.own[i, 5]
-                        c_1 -= a_11 * old_1 + a_12 * old_2
-                        c_2 -= a_12 * old_1 + a_22 * old_2
-                        new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, system.friction[i] * new_n)
-                        push(i, 1, new_1 - old_1, system, change)
-                        push(i, 2, new_2 - old_2, system, change)
-                        impulses[i, 1], impulses[i, 2] = new_1, new_2
-                        largest = ti.max(largest, a_11 * ti.abs(new_1 - old_1))
-                        largest = ti.max(largest, a_22 * ti.abs(new_2 - old_2))
+                        a_11, a_12, a_22 = work[at][OWN + 3], work[at][OWN + 4], work[at][OWN + 5]
+                        c_1 = work[at][BIAS + 1] + velocity.dot(vector_of(work, at, TANGENT))
+                        c_2 = work[at][BIAS + 2] + velocity.dot(vector_of(work, at, TANGENT + 3))
+                        c_1 += work[at][OWN + 1] * d_n - a_11 * old_1 - a_12 * old_2
+                        c_2 += work[at][OWN + 2] * d_n - a_12 * old_1 - a_22 * old_2
+                        new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, work[at][FRICTION] * new_n)
+                        d_1, d_2 = new_1 - old_1, new_2 - old_2
+                        work[at][IMPULSE + 1], work[at][IMPULSE + 2] = new_1, new_2
+                        largest = ti.max(largest, a_11 * ti.abs(d_1), a_22 * ti.abs(d_2))
+                    work[at][IMPULSE] = new_n
+                    added = d_n * vector_of(work, at, NORMAL)
+                    added += d_1 * vector_of(work, at, TANGENT) + d_2 * vector_of(work, at, TANGENT + 3)
+                    push(at, added, work, system.ease, change)
+                    square += d_n * d_n + d_1 * d_1 + d_2 * d_2
             if largest <= tolerance[island]:
                 taken = sweep + 1
                 break
-            for at in range(begin, end):
-                for row in range(3):
-                    square += (impulses[order[at], row] - work[order[at], row]) ** 2
             ratio = ti.cast(0.0, ti.f64)
             if 0.0 < square < square_before:
                 ratio = square / square_before
             square_before = square
-            if sweep < most_sweeps - 1:
+            if sweep < most - 1:
                 for at in range(begin, end):
-                    i = order[at]
-                    for row in range(3):
-                        ahead = ratio * work[i, 3 + row]
-                        work[i, 3 + row] = ahead + impulses[i, row] - work[i, row]
-                        if ahead != 0.0:
-                            impulses[i, row] += ahead
-                            push(i, row, ahead, system, change)
+                    is_ahead = False
+                    for row in ti.static(range(3)):
+                        ahead = ratio * work[at][AHEAD + row]
+                        work[at][AHEAD + row] = ahead + work[at][IMPULSE + row] - work[at][BEFORE + row]
+                        work[at][IMPULSE + row] += ahead
+                        work[at][BEFORE + row] = ahead
+                        is_ahead |= ahead != 0.0
+                    if is_ahead:
+                        push(at, along_axes(at, BEFORE, work), work, system.ease, change)
+        for at in range(begin, end):
+            for row in ti.static(range(3)):
+                impulses[order[at], row] = work[at][IMPULSE + row]
         sweeps[island] = taken

@@ -29,52 +29,39 @@ class ContactSystem:
     axes: Array  # normal and tangents, (k, 3, 3)
     bodies: Indices  # numbers of the two bodies, n where one does not belong to those that move, (k, 2)
     movers: NDArray[np.int32]  # likewise, -1 where no impulse moves it
-    jacobian: Array  # of the velocities (v, omega) of the two bodies, (k, 2, 3, 6)
-    response: Array  # M⁻¹ Jᵀ, transposed, (k, 2, 3, 6)
-    own: Array  # the contact's own block of A: nn, n1, n2, 11, 12, 22, (k, 6)
+    arms: Array  # from the centres of mass of the two bodies [m], (k, 2, 3)
+    ease: Array  # inverse mass and inertia of the moving bodies: xx, xy, xz, yy, yz, zz, (n, 7)
     islands: Indices  # numbers of the groups of contacts that hang together, (k,)
-    body_count: int  # n
 
     @classmethod
     def build(cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array) -> ContactSystem:
         """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
-        k, n = len(contacts), len(position)
-        axes = np.concatenate([contacts.normal[:, None], tangent_basis(contacts.normal)], axis=1)
+        n = len(position)
         bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n)
-        moves = np.append(inverse_mass > 0.0, False)[bodies]
-        number = np.where(bodies < n, bodies, 0)
-        arm = contacts.point[:, None] - position[number]
-        sign = np.where(bodies < n, np.array([1.0, -1.0]), 0.0)[:, :, None, None]
-        jacobian = np.empty((k, 2, 3, 6))
-        jacobian[..., :3] = sign * axes[:, None]
-        jacobian[..., 3:] = sign * cross(arm[:, :, None], axes[:, None])
-        response = np.empty_like(jacobian)
-        response[..., :3] = jacobian[..., :3] * inverse_mass[number][:, :, None, None]
-        inertia = np.where(moves[:, :, None, None], inverse_inertia[number], 0.0)
-        response[..., 3:] = np.einsum("kscj,ksij->ksci", jacobian[..., 3:], inertia)
-        blocks = np.einsum("ksci,ksdi->kcd", jacobian, response)
-        own = np.ascontiguousarray(blocks[:, *np.triu_indices(3)])
-        movers = np.where(moves, bodies, -1).astype(np.int32)
-        return cls(axes, bodies, movers, jacobian, response, own, _islands(movers, n), n)
+        movers = np.where(np.append(inverse_mass > 0.0, False)[bodies], bodies, -1).astype(np.int32)
+        axes = np.concatenate([contacts.normal[:, None], tangent_basis(contacts.normal)], axis=1)
+        # What does not belong to those that move stands still: its arm does not matter.
+        arms = contacts.point[:, None] - np.concatenate([position, np.zeros((1, 3))])[bodies]
+        inertia = inverse_inertia[:, *np.triu_indices(3)]
+        ease = np.concatenate([inverse_mass[:, None], inertia], axis=1)
+        return cls(axes, bodies, movers, arms, ease, _islands(movers, n))
+
+    @property
+    def body_count(self) -> int:
+        """n."""
+        return len(self.ease)
 
     def chosen(self, rows: Indices) -> ContactSystem:
         """The system of some of the contacts."""
         movers = self.movers[rows]
-        return ContactSystem(
-            self.axes[rows],
-            self.bodies[rows],
-            movers,
-            self.jacobian[rows],
-            self.response[rows],
-            self.own[rows],
-            _islands(movers, self.body_count),
-            self.body_count,
-        )
+        islands = _islands(movers, self.body_count)
+        return ContactSystem(self.axes[rows], self.bodies[rows], movers, self.arms[rows], self.ease, islands)
 
     def velocities(self, of_bodies: Array) -> Array:
         """Velocities at the contacts, (k, 3), of velocities (v, omega) of the moving bodies, (n, 6)."""
         both = np.concatenate([of_bodies, np.zeros((1, 6))])[self.bodies]
-        return np.einsum("ksci,ksi->kc", self.jacobian, both)
+        at = both[..., :3] + cross(both[..., 3:], self.arms)
+        return np.einsum("kci,ki->kc", self.axes, at[:, 0] - at[:, 1])
 
     def largest_of_islands(self, values: Array) -> Array:
         """The largest value at the contacts of each island, none below 0, (islands,), of (k,)."""
@@ -148,29 +135,23 @@ def _sweep(
     system: ContactSystem, bias: Array, lowest: Array, friction: Array, impulses: Array, tolerance: Array
 ) -> Solution:
     """Impulses from those given on, which are overwritten."""
-    from sim.rigid.contact_kernels import System, sweep_islands
+    from sim.rigid.contact_kernels import COLUMNS, System, sweep_islands
 
     k = len(bias)
     order = np.argsort(system.islands, kind="stable").astype(np.int32)
     first = np.concatenate([[0], np.cumsum(np.bincount(system.islands))]).astype(np.int32)
-    change, sweeps = np.zeros((system.body_count, 6)), np.zeros(len(first) - 1, dtype=np.int32)
+    islands = len(first) - 1
+    change, sweeps = np.zeros((system.body_count, 6)), np.zeros(islands, dtype=np.int32)
+    axes, arms = system.axes.reshape(k, 9), system.arms.reshape(k, 6)
     sweep_islands(
         order,
         first,
-        System(
-            system.movers,
-            system.jacobian.reshape(k, 36),
-            system.response.reshape(k, 36),
-            system.own,
-            bias,
-            lowest,
-            friction,
-        ),
+        System(system.movers, axes, arms, system.ease, bias, lowest, friction),
         tolerance,
-        MAX_ITERATIONS,
+        np.full(islands, MAX_ITERATIONS, dtype=np.int32),
         impulses,
         change,
-        np.empty((k, 6)),
+        np.empty((k, COLUMNS)),
         sweeps,
     )
     most = int(sweeps.max())
