@@ -7,6 +7,7 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
+from sim.rigid.contact_kernels import tangents_of
 from sim.rigid.contacts import BODY_BITS, FEATURE_BITS, KEPT_BONUS, MOST_PATCHES, SAME_PATCH, WALL_BITS
 
 Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -247,15 +248,6 @@ def is_among(key: ti.i64, keys: Keys) -> bool:
         else:
             high = middle - 1
     return keys[low] == key
-
-
-@ti.func
-def tangents_of(n: Vector3):
-    """Two unit tangents that depend on the normal continuously but at one pole (Duff et al. 2017)."""
-    sign = ti.select(n[2] < 0.0, -1.0, 1.0)
-    a = -1.0 / (sign + n[2])
-    b = n[0] * n[1] * a
-    return Vector3(1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), Vector3(b, sign + n[1] * n[1] * a, -n[1])
 
 
 @ti.func

@@ -17,25 +17,26 @@ MAX_FRICTION_STEPS = 12
 FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
 
 
-NORMAL, TANGENT, ARM, OWN, BIAS, LOWEST, FRICTION, MOVER, IMPULSE, BEFORE, AHEAD = 0, 3, 9, 15, 21, 24, 25, 26, 28, 31, 34
-"""Columns of what a contact is while its island is solved: arms and movers are two, tangents of three numbers too."""
-COLUMNS = 37
-Contact = ti.types.ndarray(dtype=ti.types.vector(COLUMNS, ti.f64), ndim=1)
-Change = ti.types.ndarray(dtype=ti.types.vector(6, ti.f64), ndim=1)
-Ease = ti.types.ndarray(dtype=ti.types.vector(7, ti.f64), ndim=1)
+NORMAL, TANGENT, ARM, OWN, LEAST, LOWEST, FRICTION, BODY, IMPULSE, BEFORE, AHEAD = 0, 3, 9, 15, 21, 22, 23, 24, 26, 29, 32
+"""Columns of what a contact is while its island is solved: arms and bodies are two, tangents of three numbers too."""
+COLUMNS = 35
+Work = ti.types.ndarray(dtype=ti.types.vector(COLUMNS, ti.f64), ndim=1)
+Velocities = ti.types.ndarray(dtype=ti.types.vector(6, ti.f64), ndim=1)
+Eases = ti.types.ndarray(dtype=ti.types.vector(7, ti.f64), ndim=1)
 
 
 @bundle
 class System(NamedTuple):
     """Contacts, (c,), of bodies, (n,), and what is asked of them."""
 
-    movers: Pairs  # the two bodies of each, -1 where nothing moves it, (c, 2)
-    axes: Rows  # normal and two tangents, (c, 9)
-    arms: Rows  # from the centres of mass of the two bodies [m], (c, 6)
-    ease: Ease  # inverse mass [1/kg] and inertia xx, xy, xz, yy, yz, zz in world axes [1/(kg m²)], (n, 7)
-    bias: Rows  # velocities without impulses, less the least normal ones [m/s], (c, 3)
+    bodies: Pairs  # the two bodies of each, (c, 2)
+    point: Rows  # [m], (c, 3)
+    normal: Rows  # from the second to the first, (c, 3)
+    least: Numbers  # bounds of the normal velocities from below [m/s]
     lowest: Numbers  # bounds of the normal impulses from below [N s]
     friction: Numbers  # coefficients mu [-]
+    position: Rows  # centres of mass [m], (n, 3)
+    ease: Eases  # inverse mass [1/kg] and inertia xx, xy, xz, yy, yz, zz in world axes [1/(kg m²)], (n,)
 
 
 @ti.func
@@ -45,7 +46,7 @@ def vector_of(table: ti.template(), row: ti.i32, column: ti.i32) -> Vector3:
 
 
 @ti.func
-def turned_by(ease: Ease, body: ti.i32, torque: Vector3) -> Vector3:
+def turned_by(ease: Eases, body: ti.i32, torque: Vector3) -> Vector3:
     """Change of a body's angular velocity by an angular impulse."""
     xx, xy, xz = ease[body][1], ease[body][2], ease[body][3]
     yy, yz, zz = ease[body][4], ease[body][5], ease[body][6]
@@ -57,33 +58,32 @@ def turned_by(ease: Ease, body: ti.i32, torque: Vector3) -> Vector3:
 
 
 @ti.func
-def change_at(at: ti.i32, work: Contact, change: Change) -> Vector3:
-    """Change of the relative velocity at a contact by the changes of its bodies' velocities."""
-    velocity = Vector3(0.0)
+def velocity_at(at: ti.i32, work: Work, velocity: Velocities) -> Vector3:
+    """The relative velocity of the bodies at a contact."""
+    relative = Vector3(0.0)
     for side in ti.static(range(2)):
-        body = ti.cast(work[at][MOVER + side], ti.i32)
-        if body >= 0:
-            arm = vector_of(work, at, ARM + 3 * side)
-            own = vector_of(change, body, 0) + vector_of(change, body, 3).cross(arm)
-            velocity += own if ti.static(side == 0) else -own
-    return velocity
+        body = ti.cast(work[at][BODY + side], ti.i32)
+        arm = vector_of(work, at, ARM + 3 * side)
+        own = vector_of(velocity, body, 0) + vector_of(velocity, body, 3).cross(arm)
+        relative += own if ti.static(side == 0) else -own
+    return relative
 
 
 @ti.func
-def push(at: ti.i32, impulse: Vector3, work: Contact, ease: Ease, change: Change):
-    """Add what an impulse at a contact changes of the velocities of its bodies."""
+def push(at: ti.i32, impulse: Vector3, work: Work, ease: Eases, velocity: Velocities):
+    """Give the bodies of a contact an impulse."""
     for side in ti.static(range(2)):
-        body = ti.cast(work[at][MOVER + side], ti.i32)
-        if body >= 0:
+        body = ti.cast(work[at][BODY + side], ti.i32)
+        if ease[body][0] > 0.0:
             own = impulse if ti.static(side == 0) else -impulse
             turn = turned_by(ease, body, vector_of(work, at, ARM + 3 * side).cross(own))
             for axis in ti.static(range(3)):
-                change[body][axis] += ease[body][0] * own[axis]
-                change[body][3 + axis] += turn[axis]
+                velocity[body][axis] += ease[body][0] * own[axis]
+                velocity[body][3 + axis] += turn[axis]
 
 
 @ti.func
-def along_axes(at: ti.i32, first: ti.i32, work: Contact) -> Vector3:
+def along_axes(at: ti.i32, first: ti.i32, work: Work) -> Vector3:
     """A vector in world axes of its components along the normal and the tangents, from some column on."""
     return (
         work[at][first] * vector_of(work, at, NORMAL)
@@ -92,29 +92,50 @@ def along_axes(at: ti.i32, first: ti.i32, work: Contact) -> Vector3:
     )
 
 
+@ti.func
+def tangents_of(n: Vector3):
+    """Two unit tangents that depend on the normal continuously but at one pole (Duff et al. 2017)."""
+    sign = ti.select(n[2] < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    return Vector3(1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), Vector3(b, sign + n[1] * n[1] * a, -n[1])
+
+
 @func
-def gather(at: ti.i32, i: ti.i32, system: System, impulses: Rows, work: Contact):
-    """Put together what a contact is, its own block of A among it: nn, n1, n2, 11, 12, 22."""
-    for column in ti.static(range(9)):
-        work[at][NORMAL + column] = system.axes[i, column]
-    for column in ti.static(range(6)):
-        work[at][ARM + column] = system.arms[i, column]
-    for column in ti.static(range(3)):
-        work[at][BIAS + column] = system.bias[i, column]
-        work[at][IMPULSE + column] = impulses[i, column]
-        work[at][AHEAD + column] = 0.0
-    work[at][LOWEST], work[at][FRICTION] = system.lowest[i], system.friction[i]
+def gather(at: ti.i32, i: ti.i32, system: System, impulses: Rows, work: Work):
+    """Put together what a contact is, its own block of A among it: nn, n1, n2, 11, 12, 22.
+
+    Impulses to start from push, and stay within friction.
+    """
+    normal = Vector3(system.normal[i, 0], system.normal[i, 1], system.normal[i, 2])
+    one, two = tangents_of(normal)
+    start = Vector3(impulses[i, 0], impulses[i, 1], impulses[i, 2])
+    along = Vector3(ti.max(start.dot(normal), 0.0), start.dot(one), start.dot(two))
+    rubbing, limit = ti.sqrt(along[1] * along[1] + along[2] * along[2]), system.friction[i] * along[0]
+    if rubbing > limit:
+        along[1] *= limit / rubbing
+        along[2] *= limit / rubbing
+    for axis in ti.static(range(3)):
+        work[at][NORMAL + axis], work[at][TANGENT + axis], work[at][TANGENT + 3 + axis] = (
+            normal[axis],
+            one[axis],
+            two[axis],
+        )
+        work[at][IMPULSE + axis], work[at][AHEAD + axis] = along[axis], 0.0
+    work[at][LEAST], work[at][LOWEST], work[at][FRICTION] = system.least[i], system.lowest[i], system.friction[i]
     block = ti.Vector.zero(ti.f64, 6)
     for side in ti.static(range(2)):
-        body = system.movers[i, side]
-        work[at][MOVER + side] = body
-        if body >= 0:
+        body = system.bodies[i, side]
+        work[at][BODY + side] = body
+        for axis in ti.static(range(3)):
+            work[at][ARM + 3 * side + axis] = system.point[i, axis] - system.position[body, axis]
+        if system.ease[body][0] > 0.0:
             arm = vector_of(work, at, ARM + 3 * side)
-            for one in ti.static(range(3)):
-                axis = vector_of(work, at, NORMAL + 3 * one)
+            for row in ti.static(range(3)):
+                axis = vector_of(work, at, NORMAL + 3 * row)
                 answer = system.ease[body][0] * axis + turned_by(system.ease, body, arm.cross(axis)).cross(arm)
-                for two in ti.static(range(one, 3)):
-                    block[ti.static(entry_of(one, two))] += answer.dot(vector_of(work, at, NORMAL + 3 * two))
+                for column in ti.static(range(row, 3)):
+                    block[ti.static(entry_of(row, column))] += answer.dot(vector_of(work, at, NORMAL + 3 * column))
     for entry in ti.static(range(6)):
         work[at][OWN + entry] = block[entry]
 
@@ -158,11 +179,13 @@ def sweep_islands(
     order: Whole,
     first: Whole,
     system: System,
-    tolerance: Numbers,
+    relative_tolerance: ti.f64,
+    tolerance: ti.f64,
     most_sweeps: Whole,
     impulses: Rows,
-    change: Change,
-    work: Contact,
+    velocity: Velocities,
+    along_normal: Numbers,
+    work: Work,
     sweeps: Whole,
 ):
     """Solve every island until a sweep changes no contact velocity by more than a tolerance.
@@ -175,18 +198,25 @@ def sweep_islands(
         order: contacts, island after island, (k,).
         first: where each island begins in `order`, and the end of the last, (islands + 1,).
         system: the contacts.
-        tolerance: of each island [m/s], (islands,).
+        relative_tolerance: part of the largest velocity at contacts of the island without impulses that may change.
+        tolerance: what may change besides [m/s].
         most_sweeps: after which an island is given up, (islands,).
-        impulses: to start from, and found [N s], (c, 3).
-        change: of the bodies' velocities by these impulses, (n, 6): nothing at first.
-        work: room for what contacts are, (k, COLUMNS).
+        impulses: to start from, and found, in world axes [N s], (c, 3).
+        velocity: of the bodies without impulses, and with them [m/s], [rad/s], (n,).
+        along_normal: out: relative velocity along the normals [m/s], (c,).
+        work: room for what contacts are, (k,).
         sweeps: out: how many each island took, one more than the most where it was given up, (islands,).
     """
     for island in range(first.shape[0] - 1):
         begin, end, most = first[island], first[island + 1], most_sweeps[island]
+        may_change = ti.cast(0.0, ti.f64)
         for at in range(begin, end):
             gather(at, order[at], system, impulses, work)
-            push(at, along_axes(at, IMPULSE, work), work, system.ease, change)
+            free = velocity_at(at, work, velocity)
+            may_change = ti.max(may_change, ti.abs(free).max(), ti.abs(work[at][LEAST]))
+        may_change = tolerance + relative_tolerance * may_change
+        for at in range(begin, end):
+            push(at, along_axes(at, IMPULSE, work), work, system.ease, velocity)
         taken, square_before = most + 1, ti.cast(0.0, ti.f64)
         for sweep in range(most):
             largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
@@ -195,8 +225,8 @@ def sweep_islands(
                 at = ti.select(sweep % 2 == 0, step, begin + end - 1 - step)
                 old_n, old_1, old_2 = work[at][IMPULSE], work[at][IMPULSE + 1], work[at][IMPULSE + 2]
                 work[at][BEFORE], work[at][BEFORE + 1], work[at][BEFORE + 2] = old_n, old_1, old_2
-                velocity = change_at(at, work, change)
-                w_n = work[at][BIAS] + velocity.dot(vector_of(work, at, NORMAL))
+                own = velocity_at(at, work, velocity)
+                w_n = own.dot(vector_of(work, at, NORMAL)) - work[at][LEAST]
                 new_n = ti.max(old_n - w_n / work[at][OWN], work[at][LOWEST])
                 if new_n != 0.0 or old_n != 0.0 or old_1 != 0.0 or old_2 != 0.0:
                     d_n, d_1, d_2 = new_n - old_n, ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
@@ -204,8 +234,8 @@ def sweep_islands(
                     if work[at][FRICTION] > 0.0:
                         # Slip without the tangential impulses of this contact.
                         a_11, a_12, a_22 = work[at][OWN + 3], work[at][OWN + 4], work[at][OWN + 5]
-                        c_1 = work[at][BIAS + 1] + velocity.dot(vector_of(work, at, TANGENT))
-                        c_2 = work[at][BIAS + 2] + velocity.dot(vector_of(work, at, TANGENT + 3))
+                        c_1 = own.dot(vector_of(work, at, TANGENT))
+                        c_2 = own.dot(vector_of(work, at, TANGENT + 3))
                         c_1 += work[at][OWN + 1] * d_n - a_11 * old_1 - a_12 * old_2
                         c_2 += work[at][OWN + 2] * d_n - a_12 * old_1 - a_22 * old_2
                         new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, work[at][FRICTION] * new_n)
@@ -215,9 +245,9 @@ def sweep_islands(
                     work[at][IMPULSE] = new_n
                     added = d_n * vector_of(work, at, NORMAL)
                     added += d_1 * vector_of(work, at, TANGENT) + d_2 * vector_of(work, at, TANGENT + 3)
-                    push(at, added, work, system.ease, change)
+                    push(at, added, work, system.ease, velocity)
                     square += d_n * d_n + d_1 * d_1 + d_2 * d_2
-            if largest <= tolerance[island]:
+            if largest <= may_change:
                 taken = sweep + 1
                 break
             ratio = ti.cast(0.0, ti.f64)
@@ -234,8 +264,10 @@ def sweep_islands(
                         work[at][BEFORE + row] = ahead
                         is_ahead |= ahead != 0.0
                     if is_ahead:
-                        push(at, along_axes(at, BEFORE, work), work, system.ease, change)
+                        push(at, along_axes(at, BEFORE, work), work, system.ease, velocity)
         for at in range(begin, end):
-            for row in ti.static(range(3)):
-                impulses[order[at], row] = work[at][IMPULSE + row]
+            found = along_axes(at, IMPULSE, work)
+            for axis in ti.static(range(3)):
+                impulses[order[at], axis] = found[axis]
+            along_normal[order[at]] = velocity_at(at, work, velocity).dot(vector_of(work, at, NORMAL))
         sweeps[island] = taken

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
-from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_positions, solve_velocities
+from sim.rigid.contact_solver import LARGEST_IMPULSE, RELATIVE_TOLERANCE, ContactSystem, Solution, solve_velocities
 from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
@@ -75,32 +75,30 @@ class ContactResponse:
         system = ContactSystem.build(contacts, bodies.position, inverse_mass, bodies.inverse_inertia())
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
-        velocity = np.concatenate([bodies.velocity, bodies.angular_velocity], axis=1)
-        impacts, bounces = self._bounce(contacts, bodies, system, velocity, friction, restitution, least_normal, dt)
-        free = system.velocities(velocity + impacts.change)
+        before = np.zeros((n + 1, 6))
+        before[:n, :3], before[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        impacts, bounces = self._bounce(contacts, bodies, system, before, friction, restitution, least_normal, dt)
         solution = solve_velocities(
             system,
-            free,
+            impacts.velocity,
             least_normal=least_normal,
             friction=friction,
-            start=self._starting_impulses(contacts, system, dt),
-            tolerance=self._tolerance(system, free, dt),
+            start=self._starting_impulses(contacts, dt),
+            relative_tolerance=RELATIVE_TOLERANCE,
+            tolerance=self._tolerance(dt),
         )
-        velocity = velocity + impacts.change + solution.change
-        bodies.velocity, bodies.angular_velocity = velocity[:, :3], velocity[:, 3:]
-        in_world = np.einsum("kc,kci->ki", solution.impulses, system.axes)
-        self._replace(contacts.keys, in_world / dt, is_active)
+        bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3], solution.velocity[:n, 3:]
+        self._replace(contacts.keys, solution.impulses / dt, is_active)
 
-        normal_velocity = system.velocities(velocity)[:, 0]
-        separation = self._separate(contacts, system, bounces, normal_velocity, dt)
+        separation = self._separate(contacts, system, bounces, solution.along_normals, dt)
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
-        pushed = (solution.impulses[:, 0] > 0.0) | (impacts.impulses[:, 0] > 0.0)
+        pushed = solution.impulses.any(axis=1) | impacts.impulses.any(axis=1)
         for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
             touched[np.minimum(body[pushed], n)] = True
             held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
         return Outcome(
-            separation.change[:, :3],
-            separation.change[:, 3:],
+            separation.velocity[:n, :3],
+            separation.velocity[:n, 3:],
             touched[:n],
             held[:n],
             impacts.iterations + solution.iterations + separation.iterations,
@@ -122,17 +120,19 @@ class ContactResponse:
 
         In each round contacts that approach bounce at once, together with those that never do; what can bounce and does
         not approach is left out, so that it gets the blow in the next round (Smith, Kaufman, Vouga, Tamstorf &
-        Grinspun 2012, "Reflections on simultaneous impact"). Velocities (v, omega) of the bodies [m/s], [rad/s] are
-        those before, (n, 6).
+        Grinspun 2012, "Reflections on simultaneous impact"). Velocities (v, omega) of all bodies [m/s], [rad/s] are
+        those before, (n + 1, 6).
         """
         k = len(contacts)
-        impulses, change, bounces = np.zeros((k, 3)), np.zeros((system.body_count, 6)), Bounces.none(k)
+        impulses, bounces = np.zeros((k, 3)), Bounces.none(k)
+        if not restitution.any():
+            return Solution(impulses, velocity, np.zeros(k), 0, True), bounces
         iterations, converged = 0, True
         for rounds in range(MOST_ROUNDS + 1):
             found = Bounces.find(
                 contacts,
                 bodies,
-                approach=system.velocities(velocity + change)[:, 0],
+                approach=system.along_normals(velocity),
                 restitution=restitution,
                 gravity=self._gravity,
                 dt=dt,
@@ -147,24 +147,22 @@ class ContactResponse:
             is_struck[system.islands[found.happens]] = True
             rows = np.flatnonzero(found.happens | ((restitution == 0.0) & is_struck[system.islands]))
             part = system.chosen(rows)
-            free = part.velocities(velocity + change)
             solution = solve_impacts(
                 part,
-                free,
+                velocity,
                 bounces=found.chosen(rows),
                 least_normal=least_normal[rows],
                 friction=friction[rows],
-                tolerance=self._tolerance(part, free, dt),
+                tolerance=self._tolerance(dt),
             )
             impulses[rows] += solution.impulses
-            change += solution.change
+            velocity = solution.velocity
             iterations, converged = iterations + solution.iterations, converged and solution.converged
-        return Solution(impulses, change, iterations, converged), bounces
+        return Solution(impulses, velocity, np.zeros(k), iterations, converged), bounces
 
-    def _tolerance(self, system: ContactSystem, free: Array, dt: float) -> Array:
-        """What a sweep over each island may still change when it is the last [m/s], (islands,)."""
-        fastest = system.largest_of_islands(np.abs(free).max(axis=1))
-        return RELATIVE_TOLERANCE * fastest + WEIGHT_TOLERANCE * dt * float(np.linalg.norm(self._gravity))
+    def _tolerance(self, dt: float) -> float:
+        """What a sweep may still change besides when it is the last [m/s]."""
+        return WEIGHT_TOLERANCE * dt * float(np.linalg.norm(self._gravity))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The forces that the next step starts from."""
@@ -189,21 +187,20 @@ class ContactResponse:
         order = np.argsort(keys)
         self.last_keys, self._forces = keys[order], forces[order]
 
-    def _starting_impulses(self, contacts: Contacts, system: ContactSystem, dt: float) -> Array:
-        """The forces at the same contacts in the last step times dt [s], along the axes, (k, 3)."""
+    def _starting_impulses(self, contacts: Contacts, dt: float) -> Array:
+        """The forces at the same contacts in the last step times dt [s], (k, 3)."""
         if not len(self.last_keys):
             return np.zeros((len(contacts), 3))
         rows, is_known = rows_of(contacts.keys, self.last_keys)
-        in_world = np.where(is_known[:, None], dt * self._forces[rows], 0.0)
-        return np.einsum("kci,ki->kc", system.axes, in_world)
+        return np.where(is_known[:, None], dt * self._forces[rows], 0.0)
 
     def _separate(
         self, contacts: Contacts, system: ContactSystem, bounces: Bounces, normal_velocity: Array, dt: float
     ) -> Solution:
         """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
-        overlap = -contacts.gap - SLOP
+        k, overlap, rest = len(contacts), -contacts.gap - SLOP, np.zeros((len(system.ease), 6))
         if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
-            return Solution(np.zeros((len(contacts), 3)), np.zeros((system.body_count, 6)), 0, True)
+            return Solution(np.zeros((k, 3)), rest, np.zeros(k), 0, True)
         rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
         # Contacts that do not overlap may close by what the velocities leave of their gaps.
         wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
@@ -211,5 +208,13 @@ class ContactResponse:
         wanted = np.where(
             bounces.is_placed, bounces.displacement(normal_velocity, contacts.gap) / dt - normal_velocity, wanted
         )
-        tolerance = WEIGHT_TOLERANCE * system.largest_of_islands(np.abs(wanted))
-        return solve_positions(system, wanted, two_sided=bounces.is_placed, tolerance=tolerance)
+        return solve_velocities(
+            system,
+            rest,
+            least_normal=wanted,
+            friction=np.zeros(k),
+            start=np.zeros((k, 3)),
+            relative_tolerance=WEIGHT_TOLERANCE,
+            tolerance=0.0,
+            lowest=np.where(bounces.is_placed, -LARGEST_IMPULSE, 0.0),
+        )

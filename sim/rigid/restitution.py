@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
+from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_velocities
 from sim.rigid.contacts import Array, Contacts, Indices
 from sim.rigid.states import MovingBodies
 
@@ -92,12 +92,12 @@ class Bounces:
 
 def solve_impacts(
     system: ContactSystem,
-    free: Array,
+    velocity: Array,
     *,
     bounces: Bounces,
     least_normal: Array,
     friction: Array,
-    tolerance: Array,
+    tolerance: float,
 ) -> Solution:
     """Impulses with Newton's restitution, as far as energy allows; arguments as those of `solve_velocities`.
 
@@ -114,8 +114,15 @@ def solve_impacts(
     Without friction E(1) is just the bound, as it is for all central impacts, so that Newton's law holds there. Each
     group of bodies that touch has its own s.
     """
-    solve = partial(solve_velocities, system, free, friction=friction, tolerance=tolerance)
-    nothing = np.zeros_like(free)
+    solve = partial(
+        solve_velocities,
+        system,
+        velocity,
+        friction=friction,
+        relative_tolerance=RELATIVE_TOLERANCE,
+        tolerance=tolerance,
+    )
+    nothing = np.zeros((len(least_normal), 3))
     compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=nothing)
     before = compression.impulses
     newton = solve(
@@ -124,11 +131,11 @@ def solve_impacts(
     )
     islands = system.islands
     step = newton.impulses - before
-    fall = np.stack([bounces.fall, np.zeros_like(bounces.fall), np.zeros_like(bounces.fall)], axis=1)
     # Mean velocity while an impulse acts, at the instant of the impact.
-    mean_before = free + 0.5 * system.velocities(compression.change) - fall
-    change_of_bodies = newton.change - compression.change
+    mean_before = 0.5 * system.velocities(velocity + compression.velocity) - bounces.fall[:, None] * system.normal
+    change_of_bodies = newton.velocity - compression.velocity
     change = system.velocities(change_of_bodies)
+    pressing = np.einsum("ki,ki->k", before, system.normal) * np.einsum("ki,ki->k", mean_before, system.normal)
     work_before, linear, quadratic = (
         np.bincount(islands, weights=terms)
         for terms in (
@@ -137,17 +144,17 @@ def solve_impacts(
             0.5 * np.sum(step * change, axis=1),
         )
     )
-    returned = -np.bincount(islands, weights=bounces.restitution**2 * before[:, 0] * mean_before[:, 0])
+    returned = -np.bincount(islands, weights=bounces.restitution**2 * pressing)
     most = np.maximum(np.minimum(work_before + returned, 0.0), work_before)
     share = np.array([_largest_share(*each) for each in zip(most - work_before, linear, quadratic, strict=True)])
     # Of bodies that no impulse moves nothing changes, whatever their share.
-    share_of_bodies = np.zeros(system.body_count)
+    share_of_bodies, moves = np.zeros(len(velocity)), system.moves
     for side in range(2):
-        moves = system.movers[:, side] >= 0
-        share_of_bodies[system.movers[moves, side]] = share[islands[moves]]
+        share_of_bodies[system.bodies[moves[:, side], side]] = share[islands[moves[:, side]]]
     return Solution(
         before + share[islands][:, None] * step,
-        compression.change + share_of_bodies[:, None] * change_of_bodies,
+        compression.velocity + share_of_bodies[:, None] * change_of_bodies,
+        newton.along_normals,
         compression.iterations + newton.iterations,
         compression.converged and newton.converged,
     )
