@@ -8,8 +8,11 @@ from functools import cached_property
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from taichi.lang import impl
 
 from sim.core.motion.paths import Poses
+from sim.core.reductions import runs_on_gpu
+from sim.core.scheduling import LEAST_RUN
 from sim.core.solver import Arrays
 from sim.core.walls import Wall
 from sim.rigid.broad_phase import overlapping_pairs
@@ -19,7 +22,7 @@ from sim.shapes.body_geometry import BodyGeometry
 
 CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
 TRUSTED_MOTION = 1.0e-3  # contacts are looked for anew after surfaces moved so far, in the same unit
-BLOCKS = 32  # of pairs that are looked at side by side
+BLOCKS = 512  # of pairs that a GPU looks at side by side
 
 
 class CollisionDetector:
@@ -142,7 +145,22 @@ class CollisionDetector:
     def _work(self) -> ti.Ndarray:
         from sim.rigid.collision_kernels import SCRATCH
 
-        return ti.ndarray(ti.f64, (BLOCKS * 2 * self._shapes.most_balls, SCRATCH))
+        return ti.ndarray(ti.f64, (self._blocks * 2 * self._shapes.most_balls, SCRATCH))
+
+    @cached_property
+    def _own_work(self) -> ti.Ndarray:
+        from sim.rigid.collision_kernels import SCRATCH
+
+        return ti.ndarray(ti.f64, (self._blocks * 6 * self._shapes.most_vertices, SCRATCH))
+
+    @cached_property
+    def _blocks(self) -> int:
+        """Of pairs that are looked at side by side: one a thread of a CPU."""
+        return BLOCKS if runs_on_gpu() else int(impl.current_cfg().cpu_max_num_threads)
+
+    @cached_property
+    def _run(self) -> int:
+        return 1 if runs_on_gpu() else LEAST_RUN
 
     def _is_of(self, pairs: Indices, is_active: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether one body of a pair is active, (k,)."""
@@ -191,30 +209,61 @@ class CollisionDetector:
         """Contacts of some pairs that are near, in their order."""
         if not len(first):
             return AnchoredContacts.joined([])
+        shapes = self._shapes
+        exact = shapes.are_polytopes(first) & ((wall >= 0) | shapes.are_polytopes(np.minimum(second, self._domain - 1)))
+        parts = []
+        for by_balls in (False, True):
+            rows = np.flatnonzero(exact != by_balls)
+            if len(rows):
+                parts.append(self._examine_alike(first[rows], second[rows], wall[rows], poses, motion, last, by_balls))
+        return AnchoredContacts.joined(parts)
+
+    def _examine_alike(
+        self, first: Indices, second: Indices, wall: Indices, poses: Poses, motion: Array, last: Indices, by_balls: bool
+    ) -> AnchoredContacts:
+        """Contacts of some pairs, all of polytopes or by balls, in their order."""
         from sim.rigid.collision_kernels import MOST_KEPT, Bodies, Found, Tasks, find_contacts
+        from sim.rigid.polytope_kernels import find_polytope_contacts
 
         shapes, count = self._shapes, len(first)
         sides = np.where(wall >= 0, 1, shapes.sides(first, np.minimum(second, self._domain - 1)))
-        pairs = np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32)
-        walls = [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls]
-        counts = np.zeros(count, dtype=np.int32)
-        features, planes = np.empty((count * MOST_KEPT, 2), dtype=np.int32), np.empty((count * MOST_KEPT, 6))
-        find_contacts(
-            Tasks(pairs, self._margin(first, second, motion)),
-            Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body),
-            np.array(walls or [[0.0] * 7]),
-            np.concatenate([[-1], last]),
-            shapes.on_device,
-            2 * shapes.most_balls,
-            BLOCKS,
-            self._work,
-            Found(counts, features, planes),
+        tasks = Tasks(
+            np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32),
+            self._margin(first, second, motion),
         )
+        bodies = Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body)
+        walls = np.array(
+            [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls] or [[0.0] * 7]
+        )
+        counts, room = np.zeros(count, dtype=np.int32), count * MOST_KEPT
+        features, planes, balls = np.empty((room, 2), dtype=np.int32), np.empty((room, 6)), np.empty((room, 4))
+        found = Found(counts, features, planes, np.empty(room))
+        known = np.concatenate([[-1], last])
+        if by_balls:
+            room = 2 * shapes.most_balls
+            find_contacts(
+                tasks, bodies, walls, known, shapes.on_device, room, self._blocks, self._run, self._work, found
+            )
+        else:
+            room = 2 * shapes.most_vertices
+            find_polytope_contacts(
+                tasks,
+                bodies,
+                walls,
+                known,
+                shapes.polytopes,
+                room,
+                self._blocks,
+                self._run,
+                self._own_work,
+                found,
+                balls,
+            )
         task = np.repeat(np.arange(count), counts)
         rows = np.arange(len(task)) - np.repeat(np.cumsum(counts) - counts, counts) + MOST_KEPT * task
         side, feature = features[rows].astype(np.int64).T
         owner = np.where(side == 0, first[task], second[task])
-        balls = shapes.balls_of(owner, feature)
+        balls = shapes.balls_of(owner, feature) if by_balls else balls[rows]
         return AnchoredContacts(
             owner=owner,
             other=np.where(side == 0, second[task], first[task]),

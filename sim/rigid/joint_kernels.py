@@ -11,16 +11,19 @@ Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
 Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
 Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Pairs = ti.types.ndarray(dtype=ti.i32, ndim=2)
+Velocities = ti.types.ndarray(dtype=ti.types.vector(6, ti.f64), ndim=1)
 
-MOVERS, PARENT, COLUMN, FACTOR, STATE, PATTERN, FLAG, FILLED, NEXT, WHOLE_COLUMNS = 0, 2, 3, 4, 5, 6, 7, 8, 9, 10
-"""Columns of `JointRows.whole`: the two bodies, -1 where nothing moves one; the parent in the elimination tree; where
+BODIES, MOVES, PARENT, COLUMN, FACTOR, STATE, PATTERN, FLAG, FILLED, NEXT, WHOLE_COLUMNS = (
+    0, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12,
+)  # fmt: skip
+"""Columns of `JointRows.whole`: the two bodies; whether impulses move them; the parent in the elimination tree; where
 the row's entries of the matrix begin, and those of its column of L; its state; room for the factorization; the state
 that it is to have next."""
 
 JACOBIAN, RESPONSE, BIAS, SOFTNESS, LOWER, UPPER, IMPULSE, OWN, PIVOT, SOLVED, NUMBER_COLUMNS = (
     0, 12, 24, 25, 26, 27, 28, 29, 30, 31, 32,
 )  # fmt: skip
-"""Columns of `JointRows.numbers`: J and M⁻¹ Jᵀ of both bodies; the velocity without impulses, less the wanted one;
+"""Columns of `JointRows.numbers`: J and M⁻¹ Jᵀ of both bodies; the velocity that is wanted, negative;
 velocity that an impulse of 1 N s adds by giving way; bounds of the impulse; the impulse; the diagonal of A; room."""
 
 FREE, AT_LOWER, AT_UPPER, OFF = 0, 1, 2, 3
@@ -48,25 +51,24 @@ class JointRows(NamedTuple):
 
 
 @func
-def joint_velocity(k: ti.i32, joints: JointRows, change: Rows) -> ti.f64:
-    """Velocity of a row less the wanted one, with its own giving way, by the changes of its bodies' velocities."""
+def joint_velocity(k: ti.i32, joints: JointRows, velocity: Velocities) -> ti.f64:
+    """Velocity of a row less the wanted one, with its own giving way."""
     along = joints.numbers[k, BIAS] + joints.numbers[k, SOFTNESS] * joints.numbers[k, IMPULSE]
     for side in ti.static(range(2)):
-        body = joints.whole[k, MOVERS + side]
-        if body >= 0:
-            for column in range(6):
-                along += joints.numbers[k, JACOBIAN + 6 * side + column] * change[body, column]
+        body = joints.whole[k, BODIES + side]
+        for column in range(6):
+            along += joints.numbers[k, JACOBIAN + 6 * side + column] * velocity[body][column]
     return along
 
 
 @func
-def push_joint(k: ti.i32, impulse: ti.f64, joints: JointRows, change: Rows):
+def push_joint(k: ti.i32, impulse: ti.f64, joints: JointRows, velocity: Velocities):
     """Add what an impulse of a row changes of the velocities of its bodies."""
     for side in ti.static(range(2)):
-        body = joints.whole[k, MOVERS + side]
-        if body >= 0:
+        body = joints.whole[k, BODIES + side]
+        if joints.whole[k, MOVES + side] == 1:
             for column in range(6):
-                change[body, column] += joints.numbers[k, RESPONSE + 6 * side + column] * impulse
+                velocity[body][column] += joints.numbers[k, RESPONSE + 6 * side + column] * impulse
 
 
 @func
@@ -129,7 +131,7 @@ def substitute(begin: ti.i32, end: ti.i32, joints: JointRows):
 
 
 @func
-def next_state(k: ti.i32, joints: JointRows, change: Rows) -> ti.i32:
+def next_state(k: ti.i32, joints: JointRows, velocity: Velocities) -> ti.i32:
     """The state that a row is to have by its impulse, or by its velocity where that is at a bound."""
     state, rounding = joints.whole[k, STATE], ti.cast(ROUNDING, ti.f64)
     if state == FREE:
@@ -139,14 +141,14 @@ def next_state(k: ti.i32, joints: JointRows, change: Rows) -> ti.i32:
         elif (impulse - joints.numbers[k, UPPER]) * own > rounding:
             state = AT_UPPER
     elif state != OFF:
-        along = joint_velocity(k, joints, change)
+        along = joint_velocity(k, joints, velocity)
         if (state == AT_LOWER and along < -rounding) or (state == AT_UPPER and along > rounding):
             state = FREE
     return state
 
 
 @func
-def relax_joints(component: ti.i32, joints: JointRows, change: Rows) -> ti.f64:
+def relax_joints(component: ti.i32, joints: JointRows, velocity: Velocities) -> ti.f64:
     """Impulses of all rows that joints link, for the other impulses as they are; how much a velocity changed.
 
     A mixed linear complementarity problem: block principal pivoting (Kostreva 1978), which exchanges all rows that are
@@ -161,19 +163,19 @@ def relax_joints(component: ti.i32, joints: JointRows, change: Rows) -> ti.f64:
         for k in range(begin, end):
             joints.numbers[k, SOLVED] = 0.0
             if joints.whole[k, STATE] == FREE:
-                joints.numbers[k, SOLVED] = -joint_velocity(k, joints, change)
+                joints.numbers[k, SOLVED] = -joint_velocity(k, joints, velocity)
         substitute(begin, end, joints)
         for k in range(begin, end):
             if joints.whole[k, STATE] == FREE:
                 step = joints.numbers[k, SOLVED]
                 joints.numbers[k, IMPULSE] += step
-                push_joint(k, step, joints, change)
+                push_joint(k, step, joints, velocity)
                 largest = ti.max(largest, ti.abs(step) * joints.numbers[k, OWN])
         wrong = 0
         for k in range(begin, end):
             joints.whole[k, NEXT] = joints.whole[k, STATE]
             if rounds < BLOCK_ROUNDS or wrong == 0:
-                joints.whole[k, NEXT] = next_state(k, joints, change)
+                joints.whole[k, NEXT] = next_state(k, joints, velocity)
                 wrong += ti.cast(joints.whole[k, NEXT] != joints.whole[k, STATE], ti.i32)
         if wrong == 0:
             is_settled = True
@@ -185,18 +187,18 @@ def relax_joints(component: ti.i32, joints: JointRows, change: Rows) -> ti.f64:
                 joints.whole[k, STATE] = state
                 if state != FREE:
                     bound = joints.numbers[k, ti.select(state == AT_LOWER, LOWER, UPPER)]
-                    push_joint(k, bound - joints.numbers[k, IMPULSE], joints, change)
+                    push_joint(k, bound - joints.numbers[k, IMPULSE], joints, velocity)
                     joints.numbers[k, IMPULSE] = bound
     return ti.select(is_settled, largest, ti.cast(-1.0, ti.f64))
 
 
 @kernel_of_host_arrays
-def solve_joints(joints: JointRows, change: Rows, is_settled: Whole):
+def solve_joints(joints: JointRows, velocity: Velocities, is_settled: Whole):
     """Impulses of all joints that no contact has a part in; where the work on a component ended, is 1, (c,).
 
     Some rows take microseconds: waking threads would take longer.
     """
     ti.loop_config(serialize=True)
     for component in range(joints.components.shape[0]):
-        by_joints = relax_joints(component, joints, change)
+        by_joints = relax_joints(component, joints, velocity)
         is_settled[component] = ti.cast(by_joints >= 0.0, ti.i32)

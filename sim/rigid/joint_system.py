@@ -48,15 +48,14 @@ class JointSystem:
         return cls(elimination, there, bodies, np.where(moves, bodies, -1).astype(np.int32), jacobian, response, n)
 
     def velocities(self, of_bodies: Array) -> Array:
-        """Velocities of the rows, (r,), of velocities (v, omega) of the moving bodies, (n, 6)."""
-        both = np.concatenate([of_bodies, np.zeros((1, 6))])[self.bodies]
-        return np.einsum("rsi,rsi->r", self.jacobian, both)
+        """Velocities of the rows, (r,), of velocities (v, omega) of all bodies, (n + 1, 6)."""
+        return np.einsum("rsi,rsi->r", self.jacobian, of_bodies[self.bodies])
 
     def change(self, impulses: Array) -> Array:
-        """What impulses, (r,), change of the velocities (v, omega) of the moving bodies, (n, 6)."""
+        """What impulses, (r,), change of the velocities (v, omega) of all bodies, (n + 1, 6)."""
         change = np.zeros((self.body_count + 1, 6))
         np.add.at(change, self.bodies, self.response * impulses[:, None, None])
-        return change[:-1]
+        return change
 
     def torques(self, impulses: Array) -> Array:
         """Angular impulses on the moving bodies [N m s], (n, 3), of impulses, (r,)."""
@@ -82,12 +81,12 @@ class JointSystem:
 class JointDemand:
     """What is asked of the rows of joints: w = 0 with bounds lower <= λ <= upper, and w >= 0 or <= 0 at these.
 
-    w = A λ + softness λ + bias.
+    w = J v + softness λ + bias.
     """
 
     system: JointSystem
     is_there: NDArray[np.bool_]  # rows that take part, (r,)
-    bias: Array  # velocities without impulses, less the wanted ones, (r,)
+    bias: Array  # the wanted velocities, negative, (r,)
     softness: Array  # (r,)
     lower: Array  # (r,), 0 at most
     upper: Array  # (r,), 0 at least
@@ -100,7 +99,11 @@ class JointDemand:
         entries = self.system.entries
         own = entries[order.column[1:] - 1]
         whole = np.zeros((r + 1, kernels.WHOLE_COLUMNS), dtype=np.int32)
-        whole[:-1, kernels.MOVERS :][:, :2], whole[:-1, kernels.PARENT] = self.system.movers, order.parent
+        whole[:-1, kernels.BODIES :][:, :2], whole[:-1, kernels.MOVES :][:, :2] = (
+            self.system.bodies,
+            self.system.movers >= 0,
+        )
+        whole[:-1, kernels.PARENT] = order.parent
         whole[:, kernels.COLUMN], whole[:, kernels.FACTOR] = order.column, order.factor
         state = np.where(self.lower >= 0.0, kernels.AT_LOWER, kernels.FREE)
         state = np.where(self.upper <= 0.0, kernels.AT_UPPER, state)
@@ -121,19 +124,18 @@ class JointDemand:
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Impulses of joints, and what they change."""
+    """Impulses of joints, and velocities with them."""
 
     impulses: Array  # (r,)
-    change: Array  # of the velocities (v, omega) of the moving bodies, (n, 6)
+    velocity: Array  # (v, omega) of all bodies [m/s], [rad/s], (n + 1, 6)
     converged: bool  # whether it was found in all components
 
 
-def solve_alone(demand: JointDemand) -> JointSolution:
-    """Impulses of joints alone."""
+def solve_alone(demand: JointDemand, velocity: Array) -> JointSolution:
+    """Impulses of joints alone, of all bodies with velocities (v, omega) without them [m/s], [rad/s], (n + 1, 6)."""
     from sim.rigid.joint_kernels import IMPULSE, solve_joints
 
-    rows = demand.rows()
-    change = np.zeros((demand.system.body_count, 6))
+    rows, velocity = demand.rows(), velocity.copy()
     is_settled = np.zeros(len(rows.components), dtype=np.int32)
-    solve_joints(rows, change, is_settled)
-    return JointSolution(rows.numbers[:, IMPULSE].copy(), change, bool(is_settled.all()))
+    solve_joints(rows, velocity, is_settled)
+    return JointSolution(rows.numbers[:, IMPULSE].copy(), velocity, bool(is_settled.all()))

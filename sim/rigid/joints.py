@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from sim.core.motion import rotation
 from sim.core.solver import Arrays, Diagnostics
-from sim.rigid.contact_solver import tangent_basis
 from sim.rigid.contacts import Array, Indices, pair_keys
 from sim.rigid.joint_order import elimination_of
 from sim.rigid.joint_parameters import JointParameters, points_of
@@ -128,7 +127,7 @@ class Joints:
         # The point of each body, its axis, and tangents across that.
         own = np.empty((len(parameters), 2, 4, 3))
         own[:, :, 0], own[:, :, 1] = points - position[self._bodies], axes[:, None]
-        own[:, :, 2:] = tangent_basis(axes)[:, None]
+        own[:, :, 2:] = _across(axes)[:, None]
         self._own = rotation.rotated(inverse[:, :, None], own)
         self._turn = rotation.product(rotation.conjugate(orientation[second]), orientation[first])
         self._angle = np.zeros(len(parameters))
@@ -239,23 +238,20 @@ class Joints:
         system = JointSystem.build(self._order, is_there, self._row_bodies, jacobian, inverse_mass, inverse_inertia)
         return system, self._values(frames)
 
-    def impacts(self, step: JointStep, velocity: Array) -> JointDemand:
-        """What joints ask while bodies of velocities (v, omega), (n, 6), bounce: what holds, holds."""
+    def impacts(self, step: JointStep) -> JointDemand:
+        """What joints ask while bodies bounce: what holds, holds."""
         system, holds, limits = step.system, self._does == HOLDS, self._does == LIMITS
         is_there = system.is_there & (holds | (limits & (step.values < TOUCHING)))
         nothing = np.zeros(len(holds))
         upper = np.full(len(holds), UNBOUNDED)
-        return JointDemand(
-            system, is_there, system.velocities(velocity), nothing, np.where(holds, -UNBOUNDED, 0.0), upper
-        )
+        return JointDemand(system, is_there, nothing, nothing, np.where(holds, -UNBOUNDED, 0.0), upper)
 
-    def velocities(self, step: JointStep, velocity: Array) -> JointDemand:
-        """What joints ask of a whole step, of bodies with velocities (v, omega), (n, 6), together with contacts."""
+    def velocities(self, step: JointStep) -> JointDemand:
+        """What joints ask of a whole step, together with contacts."""
         dt, does, values = step.dt, self._does, step.values
         give = self._stiffness * 0.5 * dt + self._damping
         pull = np.divide(self._stiffness * values, give, out=np.zeros_like(give), where=give > 0.0)
-        bias = step.system.velocities(velocity)
-        bias += np.select(
+        bias = np.select(
             [does == HOLDS, does == LIMITS, does == DRIVES, does == PULLS],
             [CLOSING_SHARE * values / dt, np.where(values > 0.0, 1.0, CLOSING_SHARE) * values / dt, -step.speeds, pull],
         )
@@ -324,7 +320,8 @@ class Joints:
         is_led = ~bodies.is_dynamic[moving]
         led = rotation.product(rotation.exponential(dt * bodies.angular_velocity[moving]), bodies.orientation[moving])
         position, orientation = bodies.position.copy(), bodies.orientation.copy()
-        change, converged = np.zeros((n, 6)), False
+        still = np.zeros((n + 1, 6))
+        change, converged = still.copy(), False
         start = step.values
         wanted = np.where((self._does == HOLDS) | (start < 0.0), (1.0 - CLOSING_SHARE) * start, 0.0)
         wanted[np.abs(start) <= HELD] = 0.0
@@ -352,18 +349,18 @@ class Joints:
                 ],
                 (values - wanted) / dt,
             )
-            found = solve_alone(self._demand(system, bias, softness, lower - total, upper - total))
+            found = solve_alone(self._demand(system, bias, softness, lower - total, upper - total), still)
             total = total + found.impulses
-            change += found.change
+            change += found.velocity
             spin += system.torques(found.impulses)
             if not found.converged:
                 break
-            if dt * float(np.abs(system.velocities(found.change))[system.is_there].max()) <= HELD:
+            if dt * float(np.abs(system.velocities(found.velocity))[system.is_there].max()) <= HELD:
                 holds = system.is_there & (self._does == HOLDS)
                 converged = float(np.max(np.abs(values - wanted), initial=0.0, where=holds)) <= APART
                 break
-        bodies.velocity = bodies.velocity + change[:, :3]
-        bodies.angular_velocity = bodies.angular_velocity + change[:, 3:]
+        bodies.velocity = bodies.velocity + change[:n, :3]
+        bodies.angular_velocity = bodies.angular_velocity + change[:n, 3:]
         joints_there = np.zeros(len(self), dtype=bool)
         joints_there[self._joint[system.is_there]] = True
         self._angle = np.where(joints_there, angle, self._angle)
@@ -378,16 +375,16 @@ class Joints:
         system, values = self._system(bodies, is_active, inverse_inertia)
         does, first, whole = self._does, hold.impulses, hold.is_whole
         kick = np.where((does == PULLS) & ~whole & before.is_there, first, 0.0)
-        velocity = np.concatenate([bodies.velocity, bodies.angular_velocity], axis=1) + system.change(kick)
+        velocity = system.change(kick)
+        velocity[:-1, :3] += bodies.velocity
+        velocity[:-1, 3:] += bodies.angular_velocity
         takes_part = system.is_there & (
             (does == HOLDS) | ((does == LIMITS) & (first > 0.0)) | ((does == DRIVES) & ~whole)
         )
-        bias = system.velocities(velocity) - np.where(does == DRIVES, step.speeds, 0.0)
+        bias = np.where(does == DRIVES, -step.speeds, 0.0)
         lower, upper = self._bounds(0.5 * dt)
-        found = solve_alone(JointDemand(system, takes_part, bias, np.zeros(len(does)), lower, upper))
-        velocity = velocity + found.change
-        bodies.velocity = np.where(bodies.is_dynamic[:, None], velocity[:, :3], bodies.velocity)
-        bodies.angular_velocity = np.where(bodies.is_dynamic[:, None], velocity[:, 3:], bodies.angular_velocity)
+        found = solve_alone(JointDemand(system, takes_part, bias, np.zeros(len(does)), lower, upper), velocity)
+        bodies.velocity, bodies.angular_velocity = found.velocity[:-1, :3].copy(), found.velocity[:-1, 3:].copy()
 
         last = kick + found.impulses
         self._break(before, first, system, last, dt)
@@ -554,3 +551,15 @@ def _unit(vectors: Array) -> Array:
     """Vectors, (k, 3), of unit length, along x where they have none."""
     length = np.sqrt(np.square(vectors).sum(axis=1))[:, None]
     return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), np.array([1.0, 0.0, 0.0]))
+
+
+def _across(axis: Array) -> Array:
+    """Two unit vectors across each axis, (k, 2, 3), right-handed with it (Duff et al. 2017)."""
+    x, y, z = axis.T
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    tangents = np.empty((len(axis), 2, 3))
+    tangents[:, 0, 0], tangents[:, 0, 1], tangents[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    tangents[:, 1, 0], tangents[:, 1, 1], tangents[:, 1, 2] = b, sign + y * y * a, -y
+    return tangents
