@@ -43,7 +43,9 @@ class MotorParameters(Parameters):
     speed: float | None = Field(
         default=None, description="Of the first body against the second, about or along the axis [rad/s], [m/s]."
     )
-    angle_deg: float | None = Field(default=None, description="Angle of a hinge that it turns to, from the start on.")
+    angle_deg: float | None = Field(
+        default=None, description="Angle of a hinge that it turns to, from the start on [degrees]."
+    )
     position: float | None = Field(default=None, description="Position of a slider that it goes to [m].")
     response_s: Positive = Field(
         default=0.1, description="Time in which the way to angle_deg or position falls to 1/e [s]."
@@ -86,7 +88,7 @@ class JointParameters(Parameters):
         default=None, description="Of a hinge, a slider, or the cone of a ball, at the start, in world coordinates."
     )
     limits_deg: Limits | None = Field(
-        default=None, description="Lowest and highest angle of a hinge, 0 at the start, of the first body."
+        default=None, description="Lowest and highest angle of a hinge [degrees], 0 at the start, of the first body."
     )
     limits: Limits | None = Field(
         default=None, description="Lowest and highest position of a slider [m], 0 at the start, of the first body."
