@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rigid_scenes import GRAVITY, ROOM, SPACE, advance, ball, body, cube, energy, totals
 from scipy.integrate import solve_ivp
+from thread_counts import digest_of, result_on_any_threads
 
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.solver import RigidSolver
@@ -110,14 +111,14 @@ def test_a_slider_crank_moves_its_piston_as_geometry_says():
 def test_a_motor_turns_as_fast_as_its_torque_allows_and_then_at_its_speed():
     wheel = body("wheel", {"type": "cylinder", "radius": 0.2, "height": 0.1}, (0, 0, 1))
     moment = 0.5 * DENSITY * math.pi * 0.2**2 * 0.1 * 0.2**2
-    axle = joint("axle", "hinge", ("wheel",), anchor=(0, 0, 1), axis=(0, 0, 1), motor={"speed": 3.0, "max_torque": 0.1})
+    axle = joint("axle", "hinge", ("wheel",), anchor=(0, 0, 1), axis=(0, 0, 1), motor={"speed": 0.6, "max_torque": 0.1})
     solver = scene(wheel, joints=[axle])
     advance(solver, 0.5, 2e-3)
     turned = 0.5 * 0.1 / moment * 0.5**2
     assert solver.bodies.angular_velocity[0, 2] == pytest.approx(0.1 / moment * 0.5, rel=1e-3)  # the moment by balls
     assert 2.0 * math.asin(solver.bodies.orientation[0, 3]) == pytest.approx(turned, rel=1e-3)
-    advance(solver, 1.0, 2e-3)
-    assert solver.bodies.angular_velocity[0] == pytest.approx([0, 0, 3.0], abs=1e-9)
+    advance(solver, 0.3, 2e-3)
+    assert solver.bodies.angular_velocity[0] == pytest.approx([0, 0, 0.6], abs=1e-9)
 
 
 def test_a_motor_goes_where_it_is_sent_and_holds_against_gravity():
@@ -420,3 +421,14 @@ def test_loops_that_fight_are_told_and_do_not_explode():
     assert diagnostics["joints_apart"] > 10
     assert diagnostics["joint_gap"] == pytest.approx(0.01, rel=0.7)  # the two ends are 1 cm too far apart
     assert diagnostics["max_speed"] < 1.0
+
+
+def digest_after_some_time() -> str:
+    solver = touching_scene()
+    solver.has_own_steps = True
+    advance(solver, 0.16, 2e-3)
+    return digest_of(solver.checkpoint())
+
+
+def test_joints_and_contacts_do_not_depend_on_the_number_of_threads():
+    result_on_any_threads(digest_after_some_time)
