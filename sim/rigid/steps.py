@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
-from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.broad_phase import NearBoxes
 from sim.rigid.collision import CONTACT_BAND, TRUSTED_MOTION, CollisionDetector
 from sim.rigid.contacts import Array, Indices
 from sim.rigid.states import MovingBodies
@@ -54,6 +54,7 @@ class StepChooser:
         self._radius = np.array([geometry.radius for geometry in geometries])
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
+        self._boxes = NearBoxes()
         self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
 
     def meetings(self, poses: Poses, dt: float, is_active: NDArray[np.bool_], speeds: Array | None = None) -> Meetings:
@@ -67,7 +68,7 @@ class StepChooser:
         reach = (motion + (CONTACT_BAND + TRUSTED_MOTION) * self._edge)[:, None]
         lower, upper = self._detector.boxes(poses)
         among = np.append(is_active, np.zeros(len(self._edge) - n, dtype=bool))
-        first, second = overlapping_pairs(lower - reach, upper + reach, among)
+        first, second = self._boxes.overlapping(lower - reach, upper + reach, motion, among)
 
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
         turning = np.append(spin, np.zeros(len(self._edge) - n)) * self._radius
