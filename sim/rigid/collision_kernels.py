@@ -71,6 +71,7 @@ class Found(NamedTuple):
     features: WholeRows  # side and number of the ball of each, (t MOST_KEPT, 2)
     planes: Rows  # anchor [m] and normal in the other's frame, (t MOST_KEPT, 6)
     heights: Numbers  # of the centre of the ball above its plane [m], (t MOST_KEPT,)
+    clearances: Numbers  # up to which gap they are all of the pair [m]: its margin or more, (t,)
 
 
 @ti.func

@@ -107,6 +107,7 @@ class ContactResponse:
         impacts, bounces = self._bounce(
             contacts, bodies, system, before, friction, restitution, least_normal, dt, of_impacts
         )
+        most = system.most_sweeps(before)
         solution = solve_velocities(
             system,
             impacts.velocity,
@@ -116,11 +117,12 @@ class ContactResponse:
             relative_tolerance=RELATIVE_TOLERANCE,
             tolerance=self._tolerance(dt),
             joints=of_step,
+            most=most,
         )
         bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3], solution.velocity[:n, 3:]
         self._replace(contacts.keys, solution.impulses / dt, is_active)
 
-        separation = self._separate(contacts, system, bounces, solution.along_normals, dt)
+        separation = self._separate(contacts, system, bounces, solution.along_normals, dt, most)
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
         pushed = solution.impulses.any(axis=1) | impacts.impulses.any(axis=1)
         for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
@@ -230,7 +232,13 @@ class ContactResponse:
         return np.where(is_known[:, None], dt * self._forces[rows], 0.0)
 
     def _separate(
-        self, contacts: Contacts, system: ContactSystem, bounces: Bounces, normal_velocity: Array, dt: float
+        self,
+        contacts: Contacts,
+        system: ContactSystem,
+        bounces: Bounces,
+        normal_velocity: Array,
+        dt: float,
+        most: NDArray[np.int32],
     ) -> Solution:
         """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
         k, overlap, rest = len(contacts), -contacts.gap - SLOP, np.zeros((len(system.ease), 6))
@@ -252,4 +260,5 @@ class ContactResponse:
             relative_tolerance=WEIGHT_TOLERANCE,
             tolerance=0.0,
             lowest=np.where(bounces.is_placed, -UNBOUNDED, 0.0),
+            most=most,
         )

@@ -15,6 +15,10 @@ from sim.rigid.joint_system import JointDemand
 
 MAX_ITERATIONS = 100
 NO_LINKS, NO_IMPULSES = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+COARSE_SPEED = 0.05
+COARSE_WORK, FEWEST_ITERATIONS = 10_000, 10
+"""Islands whose contacts are faster [m/s], in the mean, get as many sweeps as make so many looks at contacts, or the
+least: what is left of their overlap is far less than they move in the step."""
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 
@@ -60,6 +64,14 @@ class ContactSystem:
         islands = _islands(bodies, self.ease[:, 0] > 0.0, self.links)
         return ContactSystem(self.point[rows], self.normal[rows], bodies, self.position, self.ease, islands, self.links)
 
+    def most_sweeps(self, velocity: Array) -> NDArray[np.int32]:
+        """How many sweeps each island is worth, (islands,), with velocities (v, omega) of all bodies, (n + 1, 6)."""
+        sizes = np.bincount(self.islands)
+        speed = np.sqrt(np.square(velocity[:, :3]).sum(axis=1))[self.bodies].max(axis=1)
+        is_coarse = np.bincount(self.islands, weights=speed) > COARSE_SPEED * sizes
+        fewer = (COARSE_WORK // sizes).clip(FEWEST_ITERATIONS, MAX_ITERATIONS)
+        return np.where(is_coarse, fewer, MAX_ITERATIONS).astype(np.int32)
+
     def velocities(self, of_bodies: Array) -> Array:
         """Relative velocities at the contacts [m/s], (k, 3), of velocities (v, omega) of all bodies, (n + 1, 6)."""
         both = of_bodies[self.bodies]
@@ -94,6 +106,7 @@ def solve_velocities(
     relative_tolerance: float,
     tolerance: float,
     lowest: Array | None = None,
+    most: NDArray[np.int32] | None = None,
     joints: JointDemand | None = None,
 ) -> Solution:
     """Impulses with w_n >= least_normal, λ_n >= lowest, complementary, and Coulomb friction |λ_t| <= mu λ_n.
@@ -111,6 +124,7 @@ def solve_velocities(
         relative_tolerance: largest change of a contact velocity in the last sweep, in the largest one of the island.
         tolerance: what may change besides [m/s].
         lowest: lower bounds of the normal impulses [N s], (k,); 0 if omitted.
+        most: sweeps of each island, (islands,); if omitted, the most that there are.
         joints: what joints ask, of which those in islands with contacts are solved.
     """
     from sim.rigid.contact_kernels import COLUMNS, System, sweep_islands, sweep_jointed_islands
@@ -120,7 +134,8 @@ def solve_velocities(
     order = np.argsort(system.islands, kind="stable").astype(np.int32)
     sizes = np.bincount(system.islands)
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
-    sweeps, most = np.zeros(len(sizes), dtype=np.int32), np.full(len(sizes), MAX_ITERATIONS, dtype=np.int32)
+    most = np.full(len(sizes), MAX_ITERATIONS, dtype=np.int32) if most is None else most
+    sweeps = np.zeros(len(sizes), dtype=np.int32)
     lowest = np.zeros(k) if lowest is None else lowest
     impulses, velocity, along_normals = start.copy(), velocity.copy(), np.empty(k)
     contacts = System(
@@ -135,7 +150,7 @@ def solve_velocities(
         sweep_jointed_islands(order, first, contacts, *_joints_of_islands(system, joints), rows, *found)
         by_joints = rows.numbers[:, IMPULSE].copy()
     taken = int(sweeps.max())
-    converged = bool(np.all(sweeps <= most))
+    converged = bool(np.all((sweeps <= most) | (most < MAX_ITERATIONS)))
     return Solution(impulses, velocity, along_normals, min(taken, MAX_ITERATIONS), converged, by_joints)
 
 

@@ -154,19 +154,20 @@ def nearest_points(first: ti.i32, second: ti.i32, within: ti.f64, bodies: Bodies
     """The way from the nearest point of one body to that of another, and that one, without their radii.
 
     Returns:
-        whether they are within a distance, the way (0 where they overlap), the point of the second body.
+        a distance that they have at least, beyond the one that is asked for, or 0; the way (0 where they overlap); the
+        point of the second body.
     """
     way = vector_at(bodies.pose, first, 0) - vector_at(bodies.pose, second, 0)
     scale = way.dot(way)
     # Points of the difference of both, and the second body's part of them.
     simplex, on_second = ti.Matrix.zero(ti.f64, 4, 3), ti.Matrix.zero(ti.f64, 4, 3)
-    count, square, is_near, point = 0, ti.cast(FAR, ti.f64), True, Vector3(0.0)
+    count, square, apart, point = 0, ti.cast(FAR, ti.f64), ti.cast(0.0, ti.f64), Vector3(0.0)
     for _ in range(MOST_STEPS):
         there = farthest(way, second, bodies, polytopes)
         added = farthest(-way, first, bodies, polytopes) - there
         along = way.dot(added)
         if along > 0.0 and along * along > within * within * way.dot(way):
-            is_near = False
+            apart = along / way.norm()
             break
         if count > 0 and square - along <= CONVERGED * square:
             break
@@ -195,7 +196,7 @@ def nearest_points(first: ti.i32, second: ti.i32, within: ti.f64, bodies: Bodies
         if square <= OVERLAP * scale:
             way = Vector3(0.0)
             break
-    return is_near, way, point
+    return apart, way, point
 
 
 @func
@@ -290,12 +291,16 @@ def candidates_of_pair(
     bodies: Bodies,
     polytopes: Polytopes,
     work: Rows,
+    task: ti.i32,
+    found: Found,
 ) -> ti.i32:
-    """Note where two polytopes are near; returns the row after the last."""
+    """Note where two polytopes are near, or how far they are apart; returns the row after the last."""
     end = begin
     radius, radius_of_second = polytopes.radii[bodies.shape[first]], polytopes.radii[bodies.shape[second]]
-    is_near, way, point = nearest_points(first, second, margin + radius + radius_of_second, bodies, polytopes)
-    if is_near:
+    apart, way, point = nearest_points(first, second, margin + radius + radius_of_second, bodies, polytopes)
+    if apart > 0.0:
+        found.clearances[task] = apart - radius - radius_of_second
+    else:
         distance = way.norm()
         normal = way / ti.max(distance, 1.0e-300)  # from the second to the first
         overlaps = distance == 0.0
@@ -395,7 +400,7 @@ def find_polytope_contacts(
             if wall >= 0:
                 end = candidates_at_wall(begin, first, second, wall, margin, bodies, walls, polytopes, work)
             else:
-                end = candidates_of_pair(begin, room, first, second, margin, bodies, polytopes, work)
+                end = candidates_of_pair(begin, room, first, second, margin, bodies, polytopes, work, task, found)
             keep_few(begin, end, task, first, second, margin, last, work, found)
             for row in range(task * MOST_KEPT, task * MOST_KEPT + found.counts[task]):
                 own, other = first, second

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
-from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.broad_phase import NearBoxes
 from sim.rigid.collision import CONTACT_BAND, TRUSTED_MOTION, CollisionDetector
 from sim.rigid.contacts import Array, Indices
 from sim.rigid.states import MovingBodies
@@ -58,6 +58,7 @@ class StepChooser:
         self._radius = np.array([geometry.radius for geometry in geometries])
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
+        self._boxes = NearBoxes()
         self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
         self.links = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
@@ -72,7 +73,8 @@ class StepChooser:
         reach = (motion + (CONTACT_BAND + TRUSTED_MOTION) * self._edge)[:, None]
         lower, upper = self._detector.boxes(poses)
         among = np.append(is_active, np.zeros(len(self._edge) - n, dtype=bool))
-        first, second = self._detector.touching(*overlapping_pairs(lower - reach, upper + reach, among))
+        boxes = self._boxes.overlapping(lower - reach, upper + reach, motion, among)
+        first, second = self._detector.touching(*boxes)
 
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
         turning = np.append(spin, np.zeros(len(self._edge) - n)) * self._radius
