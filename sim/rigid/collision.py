@@ -223,7 +223,9 @@ class CollisionDetector:
             margin,
         )
         bodies = Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body)
-        walls = np.array([[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls] or [[0.0] * 7])
+        walls = np.array(
+            [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls] or [[0.0] * 7]
+        )
         counts, room = np.zeros(count, dtype=np.int32), count * MOST_KEPT
         features, planes, balls = np.empty((room, 2), dtype=np.int32), np.empty((room, 6)), np.empty((room, 4))
         found = Found(counts, features, planes, np.empty(room), margin.copy())
@@ -236,7 +238,17 @@ class CollisionDetector:
         else:
             room = 2 * shapes.most_vertices
             find_polytope_contacts(
-                tasks, bodies, walls, known, shapes.polytopes, room, self._blocks, self._run, self._own_work, found, balls
+                tasks,
+                bodies,
+                walls,
+                known,
+                shapes.polytopes,
+                room,
+                self._blocks,
+                self._run,
+                self._own_work,
+                found,
+                balls,
             )
         task = np.repeat(np.arange(count), counts)
         rows = np.arange(len(task)) - np.repeat(np.cumsum(counts) - counts, counts) + MOST_KEPT * task

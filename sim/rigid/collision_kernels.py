@@ -452,4 +452,3 @@ def find_contacts(
                             end += 1
             keep_few(begin, end, task, first, second, margin, last, work, found)
             task += blocks
-

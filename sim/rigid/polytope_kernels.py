@@ -330,9 +330,7 @@ def candidates_of_pair(
         if not overlaps and cosine < FLUSH:
             centre = turned_back(bodies.pose, second, point + way - vector_at(bodies.pose, second, 0))
             outward = turned_back(bodies.pose, second, normal)
-            add_candidate(
-                end, 0, second, NEAREST, radius, centre, outward, distance - radius_of_second, bodies, work
-            )
+            add_candidate(end, 0, second, NEAREST, radius, centre, outward, distance - radius_of_second, bodies, work)
             end += 1
     return end
 

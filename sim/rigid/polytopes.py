@@ -44,7 +44,9 @@ def polytope_of(geometry: BodyGeometry) -> Polytope | None:
     size, radius = float(np.ptp(hull.points, axis=0).max()), BALL_DEPTH * geometry.shortest_edge
     planes = _distinct(hull.equations * [1.0, 1.0, 1.0, 1.0 / size]) * [1.0, 1.0, 1.0, size]
     # The middle of the largest ball inside.
-    inside = linprog([0.0, 0.0, 0.0, -1.0], np.insert(planes[:, :3], 3, 1.0, axis=1), -planes[:, 3], bounds=(None, None))
+    inside = linprog(
+        [0.0, 0.0, 0.0, -1.0], np.insert(planes[:, :3], 3, 1.0, axis=1), -planes[:, 3], bounds=(None, None)
+    )
     if inside.x[3] < 2.0 * radius:
         return None
     planes[:, 3] += radius
