@@ -18,19 +18,8 @@ MAX_FRICTION_STEPS = 12
 FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
 
 
-NORMAL, TANGENT, ARM, OWN, LEAST, LOWEST, FRICTION, BODY, IMPULSE, BEFORE, AHEAD = (
-    0,
-    3,
-    9,
-    15,
-    21,
-    22,
-    23,
-    24,
-    26,
-    29,
-    32,
-)
+NORMAL, TANGENT, ARM, OWN = 0, 3, 9, 15
+LEAST, LOWEST, FRICTION, BODY, IMPULSE, BEFORE, AHEAD = 21, 22, 23, 24, 26, 29, 32
 """Columns of what a contact is while its island is solved: arms and bodies are two, tangents of three numbers too."""
 COLUMNS = 35
 Work = ti.types.ndarray(dtype=ti.types.vector(COLUMNS, ti.f64), ndim=1)

@@ -26,7 +26,7 @@ HOLDS, LIMITS, DRIVES, PULLS = range(4)
 0 as a spring does."""
 
 MOST_STEPS = 20  # of Newton's method to where the joints hold at the end of a step
-HELD = 1.0e-11  # error of a joint [m], [rad] at which these steps end
+HELD = 1.0e-9  # change of a gap [m], [rad] by which these steps end: what is left is far less
 APART = 1.0e-6  # error that no impulse changes: what joints ask for is more than there is to move [m], [rad]
 CLOSING_SHARE = 0.2  # of an error at the start of a step that is taken back in it
 TOUCHING = 1.0e-6  # a limit nearer than this counts as reached in an impact [m], [rad]

@@ -33,7 +33,7 @@ def find(_: str, *, chain_s: float) -> Found:
         Check("largest deviation of its energy over m g L", pendulums[1]["energy"], 0.0, 1e-3,
               "it oscillates with (omega dt)²"),
         Check("largest gap of its hinges", max(each["gap"] for each in pendulums), 0.0, 1e-9,
-              "Newton's method ends at 1e-11 m", "m"),
+              "where Newton's method ends", "m"),
         Check("largest error of the piston's place in a turn", crank["error"], 0.0, 1e-6,
               "geometry; float64, and half a step in which the motor gets rod and piston going", "m"),
         Check("lengthening of the chain", chain["stretch"], 0.0, 1e-9, "joints are solved exactly, whatever the masses",
