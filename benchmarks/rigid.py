@@ -1,23 +1,29 @@
-"""Speed of rigid bodies that fall into a pit; JSON on the standard output.
+"""Speed of rigid bodies that fall into a pit or a bowl; JSON on the standard output.
 
-    python -m benchmarks.rigid --bodies 30 200 1000 [--frames 90] [--blender]
+    python -m benchmarks.rigid --bodies 30 200 1000 [--hulls] [--frames 90] [--blender]
 
-Boxes of 10 cm, each turned in its own way, fall in layers onto each other between four walls. Times are of whole frames
-at 60 frames a second; of the frames the median counts, and the most. The processor time of all threads stands beside
-it, as other programs on the same cores do not enter it. With `--blender` Blender's own rigid bodies (bpy of this
-Python) do the same fall of the same boxes, with Blender's usual 10 steps and 10 iterations a frame; how deep boxes are
+Boxes of 10 cm, each turned in its own way, fall in layers onto each other between four walls; with `--hulls` meshes of
+convex stones of that size fall into a bowl instead. Times are of whole frames at 60 frames a second; of the frames the
+median counts, and the most. The processor time of all threads stands beside it, as other programs on the same cores do
+not enter it. With `--blender` Blender's own rigid bodies (bpy of this Python) do the same fall of the same bodies, with
+Blender's usual 10 steps and 10 iterations a frame, stones as convex hulls and the bowl as a mesh; how deep bodies are
 in each other and in walls in the end, and how fast, is measured in both by our own contacts.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from benchmarks.compare import arguments_of, child, machine, run, spread, start_taichi, timed
+from sim.core.motion import rotation
+from sim.rigid.parameters import RigidBodyParameters
 from sim.scene import SceneParameters
 
 if TYPE_CHECKING:
@@ -31,38 +37,64 @@ DENSITY, FRICTION = 500.0, 0.5
 WALL = 0.5  # thickness of Blender's walls [m]
 
 
-def places(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """Where the boxes start [m], (n, 3), how they are turned [degrees], (n, 3), and how many stand along an edge."""
-    along = max(2, round((count / 2.0) ** (1.0 / 3.0)))
+def places(count: int, along: int, pitch: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where bodies start in square layers [m], (n, 3), the lowest at half a pitch, and their turns [degrees]."""
     layer, place = np.divmod(np.arange(count), along * along)
     row, column = np.divmod(place, along)
     middle = 0.5 * (along - 1)
-    positions = PITCH * np.stack([column - middle, row - middle, layer + 0.5], axis=1)
-    return positions, np.random.default_rng(1).uniform(-180.0, 180.0, (count, 3)), along
+    positions = pitch * np.stack([column - middle, row - middle, layer + 0.5], axis=1)
+    return positions, np.random.default_rng(1).uniform(-180.0, 180.0, (count, 3))
 
 
-def scene(count: int) -> SceneParameters:
+def boxes_in_a_pit(count: int) -> SceneParameters:
     """The fall of so many boxes."""
-    positions, turns, along = places(count)
+    along = max(2, round((count / 2.0) ** (1.0 / 3.0)))
+    positions, turns = places(count, along, PITCH)
     half = 0.5 * along * PITCH
-    box = {"kind": "dynamic", "density": DENSITY, "friction": FRICTION, "shape": {"type": "box", "size": (EDGE,) * 3}}
-    return SceneParameters.model_validate(
-        {
-            "domain": {"min": (-half, -half, 0.0), "max": (half, half, positions[-1, 2] + 1.0)},
-            "rigid": [
-                {**box, "name": f"box{number}", "position": tuple(position), "rotation_deg": tuple(turn)}
-                for number, (position, turn) in enumerate(zip(positions, turns, strict=True))
-            ],
-        }
-    )
+    shape = {"type": "box", "size": (EDGE,) * 3}
+    domain = {"min": (-half, -half, 0.0), "max": (half, half, positions[-1, 2] + 1.0)}
+    return SceneParameters.model_validate({"domain": domain, "rigid": bodies(shape, positions, turns)})
 
 
-def measure(count: int, frames: int) -> dict[str, Any]:
+def hulls_in_a_bowl(count: int, mesh: Path) -> SceneParameters:
+    """The fall of so many stones, whose mesh is written to a file."""
+    points = np.random.default_rng(3).normal(size=(40, 3))
+    points *= np.array([0.6, 0.5, 0.4]) * EDGE / np.linalg.norm(points, axis=1, keepdims=True)
+    trimesh.convex.convex_hull(points).export(mesh)
+    size = count ** (1.0 / 3.0)
+    radius = 1.12 * EDGE * size
+    positions, turns = places(count, max(2, round(1.1 * size)), 1.3 * EDGE)
+    angles = np.linspace(0.0, 0.5 * np.pi, 24)
+    arc = np.stack([np.sin(angles), -np.cos(angles)], axis=1)
+    outer = radius + 0.5 * EDGE
+    outline = [*(radius * arc), (radius, radius), (outer, radius), *(outer * arc[::-1])]
+    bowl = {
+        "kind": "static",
+        "name": "bowl",
+        "friction": FRICTION,
+        "position": (0.0, 0.0, outer),
+        "shape": {"type": "revolved", "profile": [tuple(map(float, point)) for point in outline]},
+    }
+    positions[:, 2] += outer - 0.4 * radius
+    rigid = [bowl, *bodies({"type": "mesh", "file": str(mesh)}, positions, turns)]
+    domain = {"min": (-2.0 * radius, -2.0 * radius, 0.0), "max": (2.0 * radius, 2.0 * radius, positions[-1, 2] + 1.0)}
+    return SceneParameters.model_validate({"domain": domain, "rigid": rigid})
+
+
+def bodies(shape: dict[str, Any], positions: NDArray[np.float64], turns: NDArray[np.float64]) -> list[dict[str, Any]]:
+    """Dynamic bodies of one shape."""
+    alike = {"kind": "dynamic", "density": DENSITY, "friction": FRICTION, "shape": shape}
+    return [
+        {**alike, "name": f"body{number}", "position": tuple(position), "rotation_deg": tuple(turn)}
+        for number, (position, turn) in enumerate(zip(positions, turns, strict=True))
+    ]
+
+
+def measure(parameters: SceneParameters, frames: int) -> dict[str, Any]:
     """Our own fall."""
     from sim.build import build_world
     from sim.rigid.solver import RigidSolver
 
-    parameters = scene(count)
     world = build_world(parameters, frames_per_second=FRAMES_PER_SECOND)
     times = [timed(world.advance_frame) for _ in range(frames)]
     solver = next(each for each in world.solvers.values() if isinstance(each, RigidSolver))
@@ -99,13 +131,14 @@ def described(solver: RigidSolver) -> dict[str, float]:
     }
 
 
-def measure_blender(count: int, frames: int) -> dict[str, Any]:
-    """Blender's rigid bodies, in a process of its own."""
+def measure_blender(parameters: SceneParameters, frames: int, file: Path) -> dict[str, Any]:
+    """Blender's rigid bodies, in a process of its own, to which the scene goes by a file."""
     from sim.build import build_world
     from sim.rigid.solver import RigidSolver
 
-    answer = child(["-m", "benchmarks.rigid", "--as-blender", "--bodies", str(count), "--frames", str(frames)])
-    world = build_world(scene(count), frames_per_second=FRAMES_PER_SECOND)
+    file.write_text(parameters.model_dump_json())
+    answer = child(["-m", "benchmarks.rigid", "--as-blender", str(file), "--frames", str(frames)])
+    world = build_world(parameters, frames_per_second=FRAMES_PER_SECOND)
     solver = next(each for each in world.solvers.values() if isinstance(each, RigidSolver))
     before, after = (np.array(answer.pop(name)) for name in ("before", "after"))
     solver.bodies.position, solver.bodies.orientation = after[:, :3], after[:, 3:]
@@ -114,9 +147,11 @@ def measure_blender(count: int, frames: int) -> dict[str, Any]:
     return {**answer, **times, "result": described(solver)}
 
 
-def fall_in_blender(count: int, frames: int) -> dict[str, Any]:
-    """The same fall by Blender itself: times of frames [s], and the last two poses of each box. Needs bpy."""
+def fall_in_blender(parameters: SceneParameters, frames: int) -> dict[str, Any]:
+    """The same fall by Blender itself: times of frames [s], and the last two poses of each body. Needs bpy."""
     import bpy
+
+    from sim.shapes.body_geometry import BodyGeometry
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     stage = bpy.context.scene
@@ -124,36 +159,45 @@ def fall_in_blender(count: int, frames: int) -> dict[str, Any]:
     bpy.ops.rigidbody.world_add()
     stage.rigidbody_world.collection = bpy.data.collections.new("bodies")
     stage.rigidbody_world.point_cache.frame_end = frames + 1
-    positions, turns, along = places(count)
-    half, height = 0.5 * along * PITCH, positions[-1, 2] + 1.0
+    meshes: dict[Any, tuple[Any, BodyGeometry]] = {}
 
-    def add(size: tuple[float, float, float], place: Any, turn: Any, kind: str) -> Any:
-        corners = 0.5 * np.array(size) * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-        faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-        mesh = bpy.data.meshes.new("box")
-        mesh.from_pydata(corners.tolist(), [], faces)
-        box = bpy.data.objects.new("box", mesh)
-        box.location, box.rotation_euler = place, np.radians(turn)
-        stage.collection.objects.link(box)
-        stage.rigidbody_world.collection.objects.link(box)
-        body = box.rigid_body
-        body.type, body.collision_shape, body.friction, body.restitution = kind, "BOX", FRICTION, 0.0
-        if kind == "ACTIVE":
-            body.mass = DENSITY * float(np.prod(size))
-        return box
+    def add(rigid: RigidBodyParameters) -> Any:
+        if rigid.shape not in meshes:
+            geometry = BodyGeometry(rigid)
+            rest = geometry.solid.rest_mesh()
+            mesh = bpy.data.meshes.new("body")
+            mesh.from_pydata((rest.vertices - geometry.centre_of_mass).tolist(), [], rest.faces.tolist())
+            meshes[rigid.shape] = mesh, geometry
+        mesh, geometry = meshes[rigid.shape]
+        item = bpy.data.objects.new("body", mesh)
+        item.rotation_mode, item.rotation_quaternion = "QUATERNION", rotation.from_degrees(rigid.rotation_deg)
+        arm = rotation.rotated(np.array([item.rotation_quaternion]), geometry.centre_of_mass[None])[0]
+        item.location = np.asarray(rigid.position) + arm
+        stage.collection.objects.link(item)
+        stage.rigidbody_world.collection.objects.link(item)
+        body = item.rigid_body
+        body.friction, body.restitution = rigid.friction, 0.0
+        body.type = "ACTIVE" if rigid.kind == "dynamic" else "PASSIVE"
+        body.collision_shape = {"box": "BOX", "mesh": "CONVEX_HULL", "revolved": "MESH"}[rigid.shape.type]
+        if rigid.kind == "dynamic":
+            body.mass = geometry.mass_properties(rigid.density).mass
+        else:
+            body.use_margin, body.collision_margin = True, 0.0
+        return item
 
-    straight = (0.0, 0.0, 0.0)
-    add((4.0 * half, 4.0 * half, WALL), (0.0, 0.0, -0.5 * WALL), straight, "PASSIVE")
-    for side in (-1.0, 1.0):
-        away = side * (half + 0.5 * WALL)
-        add((WALL, 4.0 * half, height), (away, 0.0, 0.5 * height), straight, "PASSIVE")
-        add((4.0 * half, WALL, height), (0.0, away, 0.5 * height), straight, "PASSIVE")
-    boxes = [
-        add((EDGE,) * 3, place, turn, "ACTIVE") for place, turn in zip(positions.tolist(), turns.tolist(), strict=True)
-    ]
+    low, high = np.array(parameters.domain.min), np.array(parameters.domain.max)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    for axis, side in ((2, -1.0), (0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)):
+        size, place = 4.0 * half, middle.copy()
+        size[axis] = WALL
+        place[axis] += side * (half[axis] + 0.5 * WALL)
+        shape = {"type": "box", "size": tuple(size)}
+        add(RigidBodyParameters(name="wall", shape=shape, position=tuple(place), friction=FRICTION))
+    items = [add(rigid) for rigid in parameters.rigid]
+    moving = [item for item, rigid in zip(items, parameters.rigid, strict=True) if rigid.kind == "dynamic"]
 
     def poses() -> list[list[float]]:
-        return [[*box.matrix_world.translation, *box.matrix_world.to_quaternion()] for box in boxes]
+        return [[*item.matrix_world.translation, *item.matrix_world.to_quaternion()] for item in moving]
 
     stage.frame_set(1)
     times: list[tuple[float, float]] = []
@@ -168,20 +212,24 @@ def main() -> dict[str, Any]:
     parser = arguments_of(__doc__)
     parser.add_argument("--bodies", type=int, nargs="+", default=[30, 200, 1000], help="one fall each")
     parser.add_argument("--frames", type=int, default=90)
+    parser.add_argument("--hulls", action="store_true", help="stones into a bowl instead of boxes into a pit")
     parser.add_argument("--blender", action="store_true", help="also Blender's own rigid bodies")
-    parser.add_argument("--as-blender", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--as-blender", type=Path, help=argparse.SUPPRESS)
     asked, _ = parser.parse_known_args()
     if asked.as_blender:
-        return fall_in_blender(asked.bodies[0], asked.frames)
+        return fall_in_blender(SceneParameters.model_validate_json(asked.as_blender.read_text()), asked.frames)
     arguments = start_taichi(parser)
     runs = []
-    for count in arguments.bodies:
-        fall = {"bodies": count, **measure(count, arguments.frames)}
-        if arguments.blender:
-            fall["blender"] = measure_blender(count, arguments.frames)
-            for time_of in ("seconds", "processor_seconds"):
-                fall[f"own_over_blender_{time_of}"] = fall[time_of] / fall["blender"][time_of]
-        runs.append(fall)
+    with tempfile.TemporaryDirectory() as folder:
+        for count in arguments.bodies:
+            stone, file = Path(folder, "stone.ply"), Path(folder, "scene.json")
+            parameters = hulls_in_a_bowl(count, stone) if arguments.hulls else boxes_in_a_pit(count)
+            fall = {"bodies": count, **measure(parameters, arguments.frames)}
+            if arguments.blender:
+                fall["blender"] = measure_blender(parameters, arguments.frames, file)
+                for time_of in ("seconds", "processor_seconds"):
+                    fall[f"own_over_blender_{time_of}"] = fall[time_of] / fall["blender"][time_of]
+            runs.append(fall)
     return {**machine(arguments.device), "runs": runs}
 
 

@@ -30,6 +30,7 @@ from sim.fluid.opening_conflicts import opening_problem
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart
+from sim.rigid.joint_parameters import joint_problems
 from sim.rigid.solver import SOLVER_NAME as RIGID_NAME
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import check_start
@@ -171,11 +172,16 @@ def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: f
 
 def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
     """The solver of the bodies that move, if there are any."""
+    problems = [
+        f'joint "{scene.joint[each.number].name}": {each.text}' for each in joint_problems(scene.joint, scene.rigid)
+    ]
+    if problems:
+        raise ValueError("; ".join(problems))
     moving = [body for body in scene.rigid if body.kind != "static"]
     if not moving:
         return None
     obstacles = [body for body in scene.rigid if body.kind == "static"]
-    solver = RigidSolver(moving, obstacles=obstacles, domain=scene.domain, gravity=scene.gravity)
+    solver = RigidSolver(moving, obstacles=obstacles, joints=scene.joint, domain=scene.domain, gravity=scene.gravity)
     solver.has_own_steps = not scene.fluid and not scene.cloth
     check_start(solver)
     return solver

@@ -10,6 +10,7 @@ from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
 from sim.fluid.parameters import FluidParameters, dye_conflict
+from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 
@@ -20,6 +21,7 @@ class SceneParameters(Parameters):
     gravity: Vector3 = Field(default=(0.0, 0.0, -9.81), description="Gravity [m/s²].")
     domain: DomainParameters = Field(default=DomainParameters(), description="The box that the fluid lives in.")
     rigid: tuple[RigidBodyParameters, ...] = Field(default=(), description="Rigid bodies.")
+    joint: tuple[JointParameters, ...] = Field(default=(), description="Joints between rigid bodies, or to the world.")
     fluid: tuple[FluidParameters, ...] = Field(
         default=(), description="Particle fluids; several share one tank, and the keys that say how it is computed."
     )

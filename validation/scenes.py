@@ -196,11 +196,14 @@ def make_bodies(
     gravity: tuple[float, float, float] = EARTH,
     domain: DomainParameters = HALL,
     obstacles: Sequence[RigidBodyParameters] = (),
+    joints: Sequence[dict[str, Any]] = (),
 ) -> RigidSolver:
-    """The solver of these bodies."""
+    """The solver of these bodies, with joints as a job file describes them."""
+    from sim.rigid.joint_parameters import JointParameters
     from sim.rigid.solver import RigidSolver
 
-    return RigidSolver(bodies, obstacles=obstacles, domain=domain, gravity=gravity)
+    held = [JointParameters.model_validate(joint) for joint in joints]
+    return RigidSolver(bodies, obstacles=obstacles, joints=held, domain=domain, gravity=gravity)
 
 
 class Tank:

@@ -83,6 +83,9 @@ _KNOWN = {
         Quantity("node_count", "nodes", "", "Cloth nodes", counted=True),
         Quantity("nodes_lost", "nodes out of sight", "", "Cloth nodes out of sight", counted=True),
         Quantity("bodies_lost", "bodies out of sight", "", "Bodies out of sight", counted=True),
+        Quantity("joint_gap", "largest gap of a joint", "m", "Gap of joints"),
+        Quantity("joints_apart", "steps with joints apart", "", "Joints apart", counted=True),
+        Quantity("joints_broken", "joints broken", "", "Joints broken", counted=True),
         Quantity("particles_emitted", "particles emitted", "", _COUNT, counted=True),
         Quantity("emission_blocked", "emission blocked", "", "Particles not emitted", counted=True),
         Quantity("emission_capped", "emission capped", "", "Particles not emitted", counted=True),
@@ -180,6 +183,15 @@ WARNINGS = (
     ),
     CountedEvent("emission_capped", "particle was", "particles were", " not emitted, as there are max_particles"),
     CountedEvent("whitewater_capped", "particle was", "particles were", " not made, as there are max_particles"),
+    CountedEvent(
+        "joints_apart",
+        "step left joints apart",
+        "steps left joints apart",
+        means={
+            "rigid": "joints ask for what no motion gives, by the largest gap that is told: bodies shake there; remove "
+            "a joint of the loop, let a hinge be a ball, or move limits and motors so that they agree",
+        },
+    ),
     CountedEvent("crossings_left", "crossing", "crossings", " of cloth could not be prevented"),
     CountedEvent(
         "jammed",

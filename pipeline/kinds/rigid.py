@@ -29,11 +29,12 @@ if TYPE_CHECKING:
 
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
-    from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
+    from pipeline.kinds.checks.rigid import check_anchors, check_ballast, check_places, check_rigid_start
 
     check_places(job, solids, findings)
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
+    check_anchors(job, solids, findings)
     return 0
 
 

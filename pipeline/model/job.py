@@ -80,7 +80,7 @@ class Job(SceneParameters):
     @property
     def _named(self) -> frozenset[str]:
         """Names of all bodies, of whatever kind."""
-        tables = (getattr(self, key) for key in type(self).model_fields)
+        tables = (getattr(self, key) for key in type(self).model_fields if key != "joint")
         lists = (table for table in tables if isinstance(table, tuple))
         return frozenset(body.name for bodies in lists for body in bodies if hasattr(body, "name"))
 

@@ -85,7 +85,8 @@ class SimulateStage(Stage):
         """What decides the frames; a live recording was made once, by hand, and nothing makes another one of it."""
         if job.recorded is not None:
             return ParameterSet.of(stage=self.name, version=0, tools={}, fps=job.fps, recorded=job.recorded)
-        scene = {name: getattr(job, name) for name in SceneParameters.model_fields}
+        # Jobs without joints keep the frames that they had before there were any.
+        scene = {name: getattr(job, name) for name in SceneParameters.model_fields if name != "joint" or job.joint}
         bodies_by_content = {kind.name: [by_content(body) for body in kind.bodies(job)] for kind in KINDS.values()}
         tools = {name: tool_version(name) for name in ("taichi", "libigl", "numpy", "scipy", "trimesh")}
         return ParameterSet.of(

@@ -64,9 +64,9 @@ class FluidRigidCoupling(Coupling):
 
     def resume(self) -> None:
         """Hand the inverse masses of the bodies to the fluid, which saves where they are."""
-        bodies, response = self._rigid.bodies, self._fluid.body_forces.response
+        response = self._fluid.body_forces.response
         if response is not None:
-            response.set_mobility(bodies.inverse_mass, bodies.inverse_inertia())
+            response.set_mobility(*self._rigid.mobility())
 
 
 def samples_of_moving_bodies(

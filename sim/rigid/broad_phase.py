@@ -8,6 +8,9 @@ from scipy.spatial import cKDTree
 
 from sim.rigid.contacts import Array, Indices
 
+STEPS_AHEAD, ROOM = 5.0, 0.05
+"""Boxes are searched for with room for the motion of so many steps, and for a part of their shortest edges."""
+
 
 def overlapping_pairs(lower: Array, upper: Array, is_active: NDArray[np.bool_]) -> tuple[Indices, Indices]:
     """Pairs of boxes that overlap or touch, of which one at least is active: the lower number first, ascending.
@@ -38,3 +41,27 @@ def overlapping_pairs(lower: Array, upper: Array, is_active: NDArray[np.bool_]) 
     first, second = np.sort(np.concatenate(pairs), axis=1).T
     order = np.lexsort((second, first))
     return first[order], second[order]
+
+
+class NearBoxes:
+    """Pairs of boxes that overlap, from step to step: they are searched for anew when one has left a larger one."""
+
+    def __init__(self) -> None:
+        self._lower = self._upper = np.zeros((0, 3))
+        self._is_active = np.zeros(0, dtype=bool)
+
+    def overlapping(
+        self, lower: Array, upper: Array, motion: Array, is_active: NDArray[np.bool_]
+    ) -> tuple[Indices, Indices]:
+        """As `overlapping_pairs` has them; surfaces get about so far in a step [m], (n,)."""
+        is_known = len(self._lower) == len(lower) and not np.any(is_active & ~self._is_active)
+        if not (is_known and np.all(lower >= self._lower) and np.all(upper <= self._upper)):
+            room = (STEPS_AHEAD * motion + ROOM * (upper - lower).min(axis=1))[:, None]
+            self._lower, self._upper, self._is_active = lower - room, upper + room, is_active
+            self._first, self._second = overlapping_pairs(self._lower, self._upper, is_active)
+        first, second = self._first, self._second
+        found = is_active[first] | is_active[second]
+        for axis in range(3):
+            low, high = lower[:, axis], upper[:, axis]
+            found &= (low[first] <= high[second]) & (low[second] <= high[first])
+        return first[found], second[found]

@@ -8,18 +8,21 @@ from functools import cached_property
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from taichi.lang import impl
 
 from sim.core.motion.paths import Poses
+from sim.core.reductions import runs_on_gpu
+from sim.core.scheduling import LEAST_RUN
 from sim.core.solver import Arrays
 from sim.core.walls import Wall
-from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.broad_phase import NearBoxes
 from sim.rigid.collision_shapes import CollisionShapes
 from sim.rigid.contacts import BODY_BITS, AnchoredContacts, Array, Contacts, Indices, pair_keys, rows_of
 from sim.shapes.body_geometry import BodyGeometry
 
 CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
 TRUSTED_MOTION = 1.0e-3  # contacts are looked for anew after surfaces moved so far, in the same unit
-BLOCKS = 32  # of pairs that are looked at side by side
+BLOCKS = 512  # of pairs that a GPU looks at side by side
 
 
 class CollisionDetector:
@@ -31,6 +34,7 @@ class CollisionDetector:
 
     Attributes:
         followed: the contacts that are being followed, by pair.
+        untouching: keys of pairs of bodies that do not touch each other, as joints hold them, ascending.
 
     Raises:
         ValueError: there are too many bodies for the keys of contacts.
@@ -47,6 +51,15 @@ class CollisionDetector:
         self._size = np.array([*(geometry.shortest_edge for geometry in geometries), np.inf])
         self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.followed = AnchoredContacts.joined([])
+        self._boxes = NearBoxes()
+        self.untouching = np.zeros(0, dtype=np.int64)
+
+    def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
+        """Those of some pairs of bodies, the lower number first, that may touch, (p,) each."""
+        if not len(self.untouching):
+            return first, second
+        may = ~rows_of(pair_keys(first, second), self.untouching)[1]
+        return first[may], second[may]
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The contacts that are being followed: bodies that rest on others than before would tremble."""
@@ -88,7 +101,6 @@ class CollisionDetector:
             rows, is_known = rows_of(pairs, self._pairs)
             budget[is_known] = self._budget[rows[is_known]]
         is_stale = ahead > budget
-        budget = np.where(is_stale, self._trusted(pairs) + ahead, budget)
 
         # What no active body belongs to stays as it is.
         asleep = ~self._is_of(self._pairs, is_active)
@@ -96,7 +108,10 @@ class CollisionDetector:
         owned = pair_keys(self.followed.first, self.followed.second)
         kept = self.followed.chosen(np.flatnonzero(np.isin(owned, stays)))
         tasks = np.flatnonzero(is_stale[of_task])
-        found = self._examine(first[tasks], second[tasks], wall[tasks], poses, motion, last)
+        found, clearance = self._examine(first[tasks], second[tasks], wall[tasks], poses, motion, last)
+        clear = np.full(len(pairs), np.inf)
+        np.minimum.at(clear, of_task[tasks], clearance - CONTACT_BAND * self._smaller(first[tasks], second[tasks]))
+        budget = np.where(is_stale, clear, budget)
         if len(found) or len(kept) != len(self.followed):
             joined = AnchoredContacts.joined([kept, found])
             order = np.argsort(pair_keys(joined.first, joined.second), kind="stable")
@@ -133,17 +148,28 @@ class CollisionDetector:
     def _work(self) -> ti.Ndarray:
         from sim.rigid.collision_kernels import SCRATCH
 
-        return ti.ndarray(ti.f64, (BLOCKS * 2 * self._shapes.most_balls, SCRATCH))
+        return ti.ndarray(ti.f64, (self._blocks * 2 * self._shapes.most_balls, SCRATCH))
+
+    @cached_property
+    def _own_work(self) -> ti.Ndarray:
+        from sim.rigid.collision_kernels import SCRATCH
+
+        return ti.ndarray(ti.f64, (self._blocks * 6 * self._shapes.most_vertices, SCRATCH))
+
+    @cached_property
+    def _blocks(self) -> int:
+        """Of pairs that are looked at side by side: one a thread of a CPU."""
+        return BLOCKS if runs_on_gpu() else int(impl.current_cfg().cpu_max_num_threads)
+
+    @cached_property
+    def _run(self) -> int:
+        return 1 if runs_on_gpu() else LEAST_RUN
 
     def _is_of(self, pairs: Indices, is_active: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether one body of a pair is active, (k,)."""
         among = np.append(is_active, False)
         result: NDArray[np.bool_] = among[pairs >> BODY_BITS] | among[pairs & ((1 << BODY_BITS) - 1)]
         return result
-
-    def _trusted(self, pairs: Indices) -> Array:
-        """How far the surfaces of pairs may move until they are looked at again [m], (k,)."""
-        return TRUSTED_MOTION * self._smaller(pairs >> BODY_BITS, pairs & ((1 << BODY_BITS) - 1))
 
     def _smaller(self, first: Indices, second: Indices) -> Array:
         """Shortest edge of the smaller body of pairs [m], (k,)."""
@@ -158,7 +184,8 @@ class CollisionDetector:
     ) -> tuple[Indices, Indices, Indices]:
         """Pairs whose boxes are within their margins, and the wall that is meant, or -1: (k,) each, by pair."""
         reach = ((CONTACT_BAND + TRUSTED_MOTION) * self._size[:-1] + motion[:-1])[:, None]
-        first, second = overlapping_pairs(lower - reach, upper + reach, is_active)
+        boxes = self._boxes.overlapping(lower - reach, upper + reach, motion[:-1], is_active)
+        first, second = self.touching(*boxes)
         apart = np.maximum(lower[first] - upper[second], lower[second] - upper[first]).max(axis=1)
         near = apart <= self._margin(first, second, motion)
         pairs = [(first[near], second[near], np.full(np.count_nonzero(near), -1))]
@@ -178,35 +205,67 @@ class CollisionDetector:
 
     def _examine(
         self, first: Indices, second: Indices, wall: Indices, poses: Poses, motion: Array, last: Indices
-    ) -> AnchoredContacts:
-        """Contacts of some pairs that are near, in their order."""
-        if not len(first):
-            return AnchoredContacts.joined([])
+    ) -> tuple[AnchoredContacts, Array]:
+        """Contacts of some pairs that are near, and up to which gap [m] these are all of each pair."""
+        clearance = self._margin(first, second, motion)
+        shapes = self._shapes
+        exact = shapes.are_polytopes(first) & ((wall >= 0) | shapes.are_polytopes(np.minimum(second, self._domain - 1)))
+        parts = []
+        for by_balls in (False, True):
+            rows = np.flatnonzero(exact != by_balls)
+            if len(rows):
+                near = first[rows], second[rows], wall[rows], clearance[rows]
+                part, clearance[rows] = self._examine_alike(*near, poses, last, by_balls)
+                parts.append(part)
+        return AnchoredContacts.joined(parts), clearance
+
+    def _examine_alike(
+        self, first: Indices, second: Indices, wall: Indices, margin: Array, poses: Poses, last: Indices, by_balls: bool
+    ) -> tuple[AnchoredContacts, Array]:
+        """Likewise, within gaps [m], (k,), of pairs that are all looked at as polytopes or all by their balls."""
         from sim.rigid.collision_kernels import MOST_KEPT, Bodies, Found, Tasks, find_contacts
+        from sim.rigid.polytope_kernels import find_polytope_contacts
 
         shapes, count = self._shapes, len(first)
         sides = np.where(wall >= 0, 1, shapes.sides(first, np.minimum(second, self._domain - 1)))
-        pairs = np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32)
-        walls = [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls]
-        counts = np.zeros(count, dtype=np.int32)
-        features, planes = np.empty((count * MOST_KEPT, 2), dtype=np.int32), np.empty((count * MOST_KEPT, 6))
-        find_contacts(
-            Tasks(pairs, self._margin(first, second, motion)),
-            Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body),
-            np.array(walls or [[0.0] * 7]),
-            np.concatenate([[-1], last]),
-            shapes.on_device,
-            2 * shapes.most_balls,
-            BLOCKS,
-            self._work,
-            Found(counts, features, planes),
+        tasks = Tasks(
+            np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32),
+            margin,
         )
+        bodies = Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body)
+        walls = np.array(
+            [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls] or [[0.0] * 7]
+        )
+        counts, room = np.zeros(count, dtype=np.int32), count * MOST_KEPT
+        features, planes, balls = np.empty((room, 2), dtype=np.int32), np.empty((room, 6)), np.empty((room, 4))
+        found = Found(counts, features, planes, np.empty(room), margin.copy())
+        known = np.concatenate([[-1], last])
+        if by_balls:
+            room = 2 * shapes.most_balls
+            find_contacts(
+                tasks, bodies, walls, known, shapes.on_device, room, self._blocks, self._run, self._work, found
+            )
+        else:
+            room = 2 * shapes.most_vertices
+            find_polytope_contacts(
+                tasks,
+                bodies,
+                walls,
+                known,
+                shapes.polytopes,
+                room,
+                self._blocks,
+                self._run,
+                self._own_work,
+                found,
+                balls,
+            )
         task = np.repeat(np.arange(count), counts)
         rows = np.arange(len(task)) - np.repeat(np.cumsum(counts) - counts, counts) + MOST_KEPT * task
         side, feature = features[rows].astype(np.int64).T
         owner = np.where(side == 0, first[task], second[task])
-        balls = shapes.balls_of(owner, feature)
-        return AnchoredContacts(
+        balls = shapes.balls_of(owner, feature) if by_balls else balls[rows]
+        contacts = AnchoredContacts(
             owner=owner,
             other=np.where(side == 0, second[task], first[task]),
             side=side,
@@ -216,3 +275,4 @@ class CollisionDetector:
             anchor=planes[rows, :3],
             outward=planes[rows, 3:],
         )
+        return contacts, found.clearances

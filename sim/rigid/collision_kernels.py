@@ -7,6 +7,7 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
+from sim.rigid.contact_kernels import tangents_of
 from sim.rigid.contacts import BODY_BITS, FEATURE_BITS, KEPT_BONUS, MOST_PATCHES, SAME_PATCH, WALL_BITS
 
 Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -69,6 +70,8 @@ class Found(NamedTuple):
     counts: Whole  # of each pair, (t,)
     features: WholeRows  # side and number of the ball of each, (t MOST_KEPT, 2)
     planes: Rows  # anchor [m] and normal in the other's frame, (t MOST_KEPT, 6)
+    heights: Numbers  # of the centre of the ball above its plane [m], (t MOST_KEPT,)
+    clearances: Numbers  # up to which gap they are all of the pair [m]: its margin or more, (t,)
 
 
 @ti.func
@@ -249,15 +252,6 @@ def is_among(key: ti.i64, keys: Keys) -> bool:
 
 
 @ti.func
-def tangents_of(n: Vector3):
-    """Two unit tangents that depend on the normal continuously but at one pole (Duff et al. 2017)."""
-    sign = ti.select(n[2] < 0.0, -1.0, 1.0)
-    a = -1.0 / (sign + n[2])
-    b = n[0] * n[1] * a
-    return Vector3(1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), Vector3(b, sign + n[1] * n[1] * a, -n[1])
-
-
-@ti.func
 def choose_of_patch(
     begin: ti.i32, end: ti.i32, deepest: ti.i32, first: ti.i32, second: ti.i32, margin: ti.f64, last: Keys, work: Rows
 ):
@@ -303,6 +297,49 @@ def _angle(direction: int) -> float:
     return 2.0 * math.pi * (direction + 0.29) / 8.0
 
 
+@func
+def keep_few(
+    begin: ti.i32,
+    end: ti.i32,
+    task: ti.i32,
+    first: ti.i32,
+    second: ti.i32,
+    margin: ti.f64,
+    last: Keys,
+    work: Rows,
+    found: Found,
+):
+    """Note a few of the candidates of a pair: patches of like normals, deepest first, few of each."""
+    kept = 0
+    for _ in range(MOST_PATCHES):
+        deepest, least = -1, ti.cast(FAR, ti.f64)
+        for c in range(begin, end):
+            if work[c, 17] == FREE and work[c, 14] < least:
+                deepest, least = c, work[c, 14]
+        if deepest >= 0:
+            members = 0
+            normal = vector_at(work, deepest, 11)
+            for c in range(begin, end):
+                if work[c, 17] == FREE and normal.dot(vector_at(work, c, 11)) >= SAME_PATCH:
+                    work[c, 17] = IN_PATCH
+                    members += 1
+            if members > 2:
+                choose_of_patch(begin, end, deepest, first, second, margin, last, work)
+            for c in range(begin, end):
+                use = work[c, 17]
+                if use >= IN_PATCH:
+                    work[c, 17] = DONE
+                    row = task * MOST_KEPT + kept
+                    found.features[row, 0] = ti.cast(work[c, 15], ti.i32)
+                    found.features[row, 1] = ti.cast(work[c, 16], ti.i32)
+                    found.heights[row] = work[c, 6]
+                    for i in ti.static(range(3)):
+                        found.planes[row, i] = work[c, i] - work[c, 6] * work[c, 3 + i]
+                        found.planes[row, 3 + i] = work[c, 3 + i]
+                    kept += 1
+    found.counts[task] = kept
+
+
 @kernel_of_host_arrays
 def find_contacts(
     tasks: Tasks,
@@ -312,10 +349,11 @@ def find_contacts(
     shapes: Shapes,
     room: ti.i32,
     blocks: ti.i32,
+    run: ti.i32,
     work: Rows,
     found: Found,
 ):
-    """Contacts of each pair: by patches of like normals, deepest first, few of each.
+    """Contacts of each pair by the balls of each against the distance of the other.
 
     Args:
         tasks: the pairs.
@@ -325,12 +363,14 @@ def find_contacts(
         shapes: of the bodies.
         room: most balls of a pair.
         blocks: of pairs, which are looked at one after the other in each.
+        run: items of a loop that one thread takes at least.
         work: room for the candidates of each block, (blocks room, SCRATCH).
         found: out.
     """
-    for block in range(blocks):
+    for item in range(blocks * run):
+        block = item // run
         begin = block * room
-        task = block
+        task = ti.select(item % run == 0, block, found.counts.shape[0])
         while task < found.counts.shape[0]:
             first, second, wall, sides = (
                 tasks.pairs[task, 0],
@@ -410,31 +450,5 @@ def find_contacts(
                             work[end, 15], work[end, 17] = side, FREE
                             work[end, 16] = number + (ti.max(wall, 0) << (FEATURE_BITS - WALL_BITS))
                             end += 1
-            kept = 0
-            for _ in range(MOST_PATCHES):
-                deepest, least = -1, ti.cast(FAR, ti.f64)
-                for c in range(begin, end):
-                    if work[c, 17] == FREE and work[c, 14] < least:
-                        deepest, least = c, work[c, 14]
-                if deepest >= 0:
-                    members = 0
-                    normal = vector_at(work, deepest, 11)
-                    for c in range(begin, end):
-                        if work[c, 17] == FREE and normal.dot(vector_at(work, c, 11)) >= SAME_PATCH:
-                            work[c, 17] = IN_PATCH
-                            members += 1
-                    if members > 2:
-                        choose_of_patch(begin, end, deepest, first, second, margin, last, work)
-                    for c in range(begin, end):
-                        use = work[c, 17]
-                        if use >= IN_PATCH:
-                            work[c, 17] = DONE
-                            row = task * MOST_KEPT + kept
-                            found.features[row, 0] = ti.cast(work[c, 15], ti.i32)
-                            found.features[row, 1] = ti.cast(work[c, 16], ti.i32)
-                            for i in ti.static(range(3)):
-                                found.planes[row, i] = work[c, i] - work[c, 6] * work[c, 3 + i]
-                                found.planes[row, 3 + i] = work[c, 3 + i]
-                            kept += 1
-            found.counts[task] = kept
+            keep_few(begin, end, task, first, second, margin, last, work, found)
             task += blocks

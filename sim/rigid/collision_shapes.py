@@ -12,6 +12,8 @@ from taichi.lang.util import to_taichi_type
 
 from sim.rigid import collision_kernels as kernels
 from sim.rigid.contacts import FEATURE_BITS, WALL_BITS, Array, Indices
+from sim.rigid.polytope_kernels import Polytopes
+from sim.rigid.polytopes import Polytope, polytope_of
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 from sim.shapes.revolved import Revolved
@@ -38,6 +40,8 @@ class CollisionShapes:
         of_body: number of the shape of each body, (b,) int32.
         tables: what `find_contacts` reads, in the host's memory; `on_device` in the device's, which keeps it.
         most_balls: of a shape.
+        polytopes: those shapes that are, on the device.
+        most_vertices: of one of them.
     """
 
     def __init__(self, geometries: Sequence[BodyGeometry]) -> None:
@@ -80,17 +84,48 @@ class CollisionShapes:
         self.most_balls = int(whole[:, kernels.BALLS].max())
         if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
             raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
+        found = [polytope_of(geometry) for geometry in shapes]
+        self._is_polytope = np.array([each is not None for each in found])
+        self.polytopes = Polytopes(*map(_kept, _tables_of(found)))
+        self.most_vertices = max((len(each.vertices) for each in found if each is not None), default=0)
         self._sides = np.array([[_sides(one, two) for two in shapes] for one in shapes], dtype=np.int32)
 
     def sides(self, first: Indices, second: Indices) -> NDArray[np.int32]:
         """Whose balls are to be looked at in pairs of bodies: 1 the first's, 2 the second's, 3 both, (k,)."""
         return self._sides[self.of_body[first], self.of_body[second]]
 
+    def are_polytopes(self, bodies: Indices) -> NDArray[np.bool_]:
+        """Whether bodies are, (k,)."""
+        result: NDArray[np.bool_] = self._is_polytope[self.of_body[bodies]]
+        return result
+
     def balls_of(self, body: Indices, feature: Indices) -> Array:
         """The balls that contacts name: centre, radius, axis, cone, (k, 8)."""
         number = feature & ((1 << (FEATURE_BITS - WALL_BITS)) - 1)
         found: Array = self.tables.balls[self.tables.whole[self.of_body[body], kernels.FIRST_BALL] + number]
         return found
+
+
+def _tables_of(shapes: Sequence[Polytope | None]) -> Polytopes:
+    """What kernels read of polytopes, in the host's memory."""
+    found = [each for each in shapes if each is not None]
+    none = Polytope(0.0, np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+    whole = np.zeros((len(shapes), 4), dtype=np.int32)
+    whole[:, 1::2] = [[len(each.vertices), len(each.planes)] for each in (shape or none for shape in shapes)]
+    whole[:, ::2] = np.cumsum(whole[:, 1::2], axis=0) - whole[:, 1::2]
+    counts = np.concatenate([each.counts for each in found] or [none.counts])
+    rows = [(each.vertices, each.planes, each.corners) for each in found]
+    rows.append((np.zeros((1, 3)), np.zeros((1, 4)), np.zeros(1, dtype=np.int64)))  # there is one at least
+    vertices, planes, corners = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    loops = np.stack([np.cumsum(counts) - counts, counts], axis=1)
+    return Polytopes(
+        whole,
+        np.array([(each or none).radius for each in shapes]),
+        vertices,
+        planes,
+        np.concatenate([loops, np.zeros((1, 2), dtype=np.int64)]).astype(np.int32),
+        corners.astype(np.int32),
+    )
 
 
 def _kept(numbers: NDArray[np.generic]) -> ti.Ndarray:

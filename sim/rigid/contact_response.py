@@ -9,8 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
-from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_positions, solve_velocities
+from sim.rigid.contact_solver import (
+    NO_IMPULSES,
+    NO_LINKS,
+    RELATIVE_TOLERANCE,
+    ContactSystem,
+    Solution,
+    solve_velocities,
+)
 from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
+from sim.rigid.joint_system import UNBOUNDED, JointDemand, solve_alone
+from sim.rigid.joints import Joints, JointStep
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
@@ -46,6 +55,7 @@ class Outcome:
     is_held: NDArray[np.bool_]  # bodies that got one from what cannot move, (n,) bool
     iterations: int  # sweeps of the solver
     converged: bool  # whether it converged
+    joint_impulses: Array  # of the joints, (r,), if there are any
 
 
 class ContactResponse:
@@ -59,10 +69,20 @@ class ContactResponse:
         self._surfaces, self._gravity = surfaces, gravity
         self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
-    def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float, is_active: NDArray[np.bool_]) -> Outcome:
+    def resolve(
+        self,
+        contacts: Contacts,
+        bodies: MovingBodies,
+        dt: float,
+        is_active: NDArray[np.bool_],
+        inverse_inertia: Array,
+        joints: Joints | None = None,
+        step: JointStep | None = None,
+    ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
-        These are all their contacts; what is known of those of other bodies stays.
+        These are all their contacts; what is known of those of other bodies stays. Inverse inertia tensors are in world
+        axes, (n, 3, 3); joints, with their step, hold where contacts are.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
@@ -70,41 +90,52 @@ class ContactResponse:
         if not len(contacts):
             self._replace(contacts.keys, np.zeros((0, 3)), is_active)
             nobody = np.zeros(n, dtype=bool)
-            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody, 0, True)
+            still = np.zeros(0 if step is None else len(step.values))
+            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), 0, True, still)
         inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
-        system = ContactSystem.build(contacts, bodies.position, inverse_mass, bodies.inverse_inertia())
+        links = NO_LINKS if step is None else step.system.links()
+        system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
-        velocity = np.concatenate([bodies.velocity, bodies.angular_velocity], axis=1)
-        impacts, bounces = self._bounce(contacts, bodies, system, velocity, friction, restitution, least_normal, dt)
-        free = system.velocities(velocity + impacts.change)
+        before = np.zeros((n + 1, 6))
+        before[:n, :3], before[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        of_impacts, of_step, by_joints = None, None, NO_IMPULSES
+        if joints is not None and step is not None:
+            of_impacts, of_step = joints.impacts(step), joints.velocities(step)
+            alone = solve_alone(of_impacts, before)  # impacts are of bodies that the joints hold already
+            before, by_joints = alone.velocity, alone.impulses
+        impacts, bounces = self._bounce(
+            contacts, bodies, system, before, friction, restitution, least_normal, dt, of_impacts
+        )
+        most = system.most_sweeps(before)
         solution = solve_velocities(
             system,
-            free,
+            impacts.velocity,
             least_normal=least_normal,
             friction=friction,
-            start=self._starting_impulses(contacts, system, dt),
-            tolerance=self._tolerance(system, free, dt),
+            start=self._starting_impulses(contacts, dt),
+            relative_tolerance=RELATIVE_TOLERANCE,
+            tolerance=self._tolerance(dt),
+            joints=of_step,
+            most=most,
         )
-        velocity = velocity + impacts.change + solution.change
-        bodies.velocity, bodies.angular_velocity = velocity[:, :3], velocity[:, 3:]
-        in_world = np.einsum("kc,kci->ki", solution.impulses, system.axes)
-        self._replace(contacts.keys, in_world / dt, is_active)
+        bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3], solution.velocity[:n, 3:]
+        self._replace(contacts.keys, solution.impulses / dt, is_active)
 
-        normal_velocity = system.velocities(velocity)[:, 0]
-        separation = self._separate(contacts, system, bounces, normal_velocity, dt)
+        separation = self._separate(contacts, system, bounces, solution.along_normals, dt, most)
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
-        pushed = (solution.impulses[:, 0] > 0.0) | (impacts.impulses[:, 0] > 0.0)
+        pushed = solution.impulses.any(axis=1) | impacts.impulses.any(axis=1)
         for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
             touched[np.minimum(body[pushed], n)] = True
             held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
         return Outcome(
-            separation.change[:, :3],
-            separation.change[:, 3:],
+            separation.velocity[:n, :3],
+            separation.velocity[:n, 3:],
             touched[:n],
             held[:n],
             impacts.iterations + solution.iterations + separation.iterations,
             impacts.converged and solution.converged and separation.converged,
+            by_joints + impacts.joint_impulses + solution.joint_impulses,
         )
 
     def _bounce(
@@ -117,22 +148,26 @@ class ContactResponse:
         restitution: Array,
         least_normal: Array,
         dt: float,
+        joints: JointDemand | None,
     ) -> tuple[Solution, Bounces]:
         """The impacts of a step in rounds: a blow goes through bodies that touch, or nearly, one after the other.
 
         In each round contacts that approach bounce at once, together with those that never do; what can bounce and does
         not approach is left out, so that it gets the blow in the next round (Smith, Kaufman, Vouga, Tamstorf &
-        Grinspun 2012, "Reflections on simultaneous impact"). Velocities (v, omega) of the bodies [m/s], [rad/s] are
-        those before, (n, 6).
+        Grinspun 2012, "Reflections on simultaneous impact"). Velocities (v, omega) of all bodies [m/s], [rad/s] are
+        those before, (n + 1, 6).
         """
         k = len(contacts)
-        impulses, change, bounces = np.zeros((k, 3)), np.zeros((system.body_count, 6)), Bounces.none(k)
+        impulses, bounces = np.zeros((k, 3)), Bounces.none(k)
+        by_joints = NO_IMPULSES if joints is None else np.zeros(len(joints.bias))
+        if not restitution.any():
+            return Solution(impulses, velocity, np.zeros(k), 0, True, by_joints), bounces
         iterations, converged = 0, True
         for rounds in range(MOST_ROUNDS + 1):
             found = Bounces.find(
                 contacts,
                 bodies,
-                approach=system.velocities(velocity + change)[:, 0],
+                approach=system.along_normals(velocity),
                 restitution=restitution,
                 gravity=self._gravity,
                 dt=dt,
@@ -147,24 +182,24 @@ class ContactResponse:
             is_struck[system.islands[found.happens]] = True
             rows = np.flatnonzero(found.happens | ((restitution == 0.0) & is_struck[system.islands]))
             part = system.chosen(rows)
-            free = part.velocities(velocity + change)
             solution = solve_impacts(
                 part,
-                free,
+                velocity,
                 bounces=found.chosen(rows),
                 least_normal=least_normal[rows],
                 friction=friction[rows],
-                tolerance=self._tolerance(part, free, dt),
+                tolerance=self._tolerance(dt),
+                joints=joints,
             )
+            by_joints = by_joints + solution.joint_impulses
             impulses[rows] += solution.impulses
-            change += solution.change
+            velocity = solution.velocity
             iterations, converged = iterations + solution.iterations, converged and solution.converged
-        return Solution(impulses, change, iterations, converged), bounces
+        return Solution(impulses, velocity, np.zeros(k), iterations, converged, by_joints), bounces
 
-    def _tolerance(self, system: ContactSystem, free: Array, dt: float) -> Array:
-        """What a sweep over each island may still change when it is the last [m/s], (islands,)."""
-        fastest = system.largest_of_islands(np.abs(free).max(axis=1))
-        return RELATIVE_TOLERANCE * fastest + WEIGHT_TOLERANCE * dt * float(np.linalg.norm(self._gravity))
+    def _tolerance(self, dt: float) -> float:
+        """What a sweep may still change besides when it is the last [m/s]."""
+        return WEIGHT_TOLERANCE * dt * float(np.linalg.norm(self._gravity))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The forces that the next step starts from."""
@@ -189,21 +224,26 @@ class ContactResponse:
         order = np.argsort(keys)
         self.last_keys, self._forces = keys[order], forces[order]
 
-    def _starting_impulses(self, contacts: Contacts, system: ContactSystem, dt: float) -> Array:
-        """The forces at the same contacts in the last step times dt [s], along the axes, (k, 3)."""
+    def _starting_impulses(self, contacts: Contacts, dt: float) -> Array:
+        """The forces at the same contacts in the last step times dt [s], (k, 3)."""
         if not len(self.last_keys):
             return np.zeros((len(contacts), 3))
         rows, is_known = rows_of(contacts.keys, self.last_keys)
-        in_world = np.where(is_known[:, None], dt * self._forces[rows], 0.0)
-        return np.einsum("kci,ki->kc", system.axes, in_world)
+        return np.where(is_known[:, None], dt * self._forces[rows], 0.0)
 
     def _separate(
-        self, contacts: Contacts, system: ContactSystem, bounces: Bounces, normal_velocity: Array, dt: float
+        self,
+        contacts: Contacts,
+        system: ContactSystem,
+        bounces: Bounces,
+        normal_velocity: Array,
+        dt: float,
+        most: NDArray[np.int32],
     ) -> Solution:
         """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
-        overlap = -contacts.gap - SLOP
+        k, overlap, rest = len(contacts), -contacts.gap - SLOP, np.zeros((len(system.ease), 6))
         if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
-            return Solution(np.zeros((len(contacts), 3)), np.zeros((system.body_count, 6)), 0, True)
+            return Solution(np.zeros((k, 3)), rest, np.zeros(k), 0, True, NO_IMPULSES)
         rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
         # Contacts that do not overlap may close by what the velocities leave of their gaps.
         wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
@@ -211,5 +251,14 @@ class ContactResponse:
         wanted = np.where(
             bounces.is_placed, bounces.displacement(normal_velocity, contacts.gap) / dt - normal_velocity, wanted
         )
-        tolerance = WEIGHT_TOLERANCE * system.largest_of_islands(np.abs(wanted))
-        return solve_positions(system, wanted, two_sided=bounces.is_placed, tolerance=tolerance)
+        return solve_velocities(
+            system,
+            rest,
+            least_normal=wanted,
+            friction=np.zeros(k),
+            start=np.zeros((k, 3)),
+            relative_tolerance=WEIGHT_TOLERANCE,
+            tolerance=0.0,
+            lowest=np.where(bounces.is_placed, -UNBOUNDED, 0.0),
+            most=most,
+        )

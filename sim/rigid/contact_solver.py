@@ -11,9 +11,14 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.rotation import cross
 from sim.rigid.contacts import Array, Contacts, Indices
+from sim.rigid.joint_system import JointDemand
 
 MAX_ITERATIONS = 100
-LARGEST_IMPULSE = 1.0e300  # [N s]: kernels know no infinity
+NO_LINKS, NO_IMPULSES = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+COARSE_SPEED = 0.05
+COARSE_WORK, FEWEST_ITERATIONS = 10_000, 10
+"""Islands whose contacts are faster [m/s], in the mean, get as many sweeps as make so many looks at contacts, or the
+least: what is left of their overlap is far less than they move in the step."""
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 
@@ -21,82 +26,90 @@ RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep m
 class ContactSystem:
     """The linear relation between impulses at contacts and velocities there.
 
-    Contact i has three rows: the normal and two tangents. With the Jacobian J, mass matrix M and impulses λ the
-    velocities at the contacts are w = A λ + b, A = J M⁻¹ Jᵀ, b = J v. A contact knows two bodies, so that A is sparse;
-    it is never formed. Impulses in one island do not change velocities in another.
+    With the Jacobian J, mass matrix M and impulses λ the velocities at the contacts are w = A λ + b, A = J M⁻¹ Jᵀ,
+    b = J v. A contact knows two bodies, so that A is sparse; it is never formed. Impulses in one island do not change
+    velocities in another, through joints either.
     """
 
-    axes: Array  # normal and tangents, (k, 3, 3)
-    bodies: Indices  # numbers of the two bodies, n where one does not belong to those that move, (k, 2)
-    movers: NDArray[np.int32]  # likewise, -1 where no impulse moves it
-    jacobian: Array  # of the velocities (v, omega) of the two bodies, (k, 2, 3, 6)
-    response: Array  # M⁻¹ Jᵀ, transposed, (k, 2, 3, 6)
-    own: Array  # the contact's own block of A: nn, n1, n2, 11, 12, 22, (k, 6)
+    point: Array  # [m], (k, 3)
+    normal: Array  # from the second to the first, (k, 3)
+    bodies: NDArray[np.int32]  # numbers of the two bodies, n where one does not belong to those that move, (k, 2)
+    position: Array  # of the moving bodies and of one that stands still [m], (n + 1, 3)
+    ease: Array  # of these, inverse mass and inertia: xx, xy, xz, yy, yz, zz, (n + 1, 7)
     islands: Indices  # numbers of the groups of contacts that hang together, (k,)
-    body_count: int  # n
+    links: Indices  # pairs of bodies that joints link, (l, 2)
 
     @classmethod
-    def build(cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array) -> ContactSystem:
+    def build(
+        cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array, links: Indices = NO_LINKS
+    ) -> ContactSystem:
         """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
-        k, n = len(contacts), len(position)
-        axes = np.concatenate([contacts.normal[:, None], tangent_basis(contacts.normal)], axis=1)
-        bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n)
-        moves = np.append(inverse_mass > 0.0, False)[bodies]
-        number = np.where(bodies < n, bodies, 0)
-        arm = contacts.point[:, None] - position[number]
-        sign = np.where(bodies < n, np.array([1.0, -1.0]), 0.0)[:, :, None, None]
-        jacobian = np.empty((k, 2, 3, 6))
-        jacobian[..., :3] = sign * axes[:, None]
-        jacobian[..., 3:] = sign * cross(arm[:, :, None], axes[:, None])
-        response = np.empty_like(jacobian)
-        response[..., :3] = jacobian[..., :3] * inverse_mass[number][:, :, None, None]
-        inertia = np.where(moves[:, :, None, None], inverse_inertia[number], 0.0)
-        response[..., 3:] = np.einsum("kscj,ksij->ksci", jacobian[..., 3:], inertia)
-        blocks = np.einsum("ksci,ksdi->kcd", jacobian, response)
-        own = np.ascontiguousarray(blocks[:, *np.triu_indices(3)])
-        movers = np.where(moves, bodies, -1).astype(np.int32)
-        return cls(axes, bodies, movers, jacobian, response, own, _islands(movers, n), n)
+        n = len(position)
+        bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n).astype(np.int32)
+        ease = np.zeros((n + 1, 7))
+        ease[:n, 0], ease[:n, 1:] = inverse_mass, inverse_inertia.reshape(n, 9)[:, [0, 1, 2, 4, 5, 8]]
+        position = np.concatenate([position, np.zeros((1, 3))])
+        islands = _islands(bodies, ease[:, 0] > 0.0, links)
+        return cls(contacts.point, contacts.normal, bodies, position, ease, islands, links)
+
+    @property
+    def moves(self) -> NDArray[np.bool_]:
+        """Whether impulses move the two bodies of contacts, (k, 2)."""
+        result: NDArray[np.bool_] = self.ease[self.bodies, 0] > 0.0
+        return result
 
     def chosen(self, rows: Indices) -> ContactSystem:
         """The system of some of the contacts."""
-        movers = self.movers[rows]
-        return ContactSystem(
-            self.axes[rows],
-            self.bodies[rows],
-            movers,
-            self.jacobian[rows],
-            self.response[rows],
-            self.own[rows],
-            _islands(movers, self.body_count),
-            self.body_count,
-        )
+        bodies = self.bodies[rows]
+        islands = _islands(bodies, self.ease[:, 0] > 0.0, self.links)
+        return ContactSystem(self.point[rows], self.normal[rows], bodies, self.position, self.ease, islands, self.links)
+
+    def most_sweeps(self, velocity: Array) -> NDArray[np.int32]:
+        """How many sweeps each island is worth, (islands,), with velocities (v, omega) of all bodies, (n + 1, 6)."""
+        sizes = np.bincount(self.islands)
+        speed = np.sqrt(np.square(velocity[:, :3]).sum(axis=1))[self.bodies].max(axis=1)
+        is_coarse = np.bincount(self.islands, weights=speed) > COARSE_SPEED * sizes
+        fewer = (COARSE_WORK // sizes).clip(FEWEST_ITERATIONS, MAX_ITERATIONS)
+        return np.where(is_coarse, fewer, MAX_ITERATIONS).astype(np.int32)
 
     def velocities(self, of_bodies: Array) -> Array:
-        """Velocities at the contacts, (k, 3), of velocities (v, omega) of the moving bodies, (n, 6)."""
-        both = np.concatenate([of_bodies, np.zeros((1, 6))])[self.bodies]
-        return np.einsum("ksci,ksi->kc", self.jacobian, both)
+        """Relative velocities at the contacts [m/s], (k, 3), of velocities (v, omega) of all bodies, (n + 1, 6)."""
+        both = of_bodies[self.bodies]
+        at = both[..., :3] + cross(both[..., 3:], self.point[:, None] - self.position[self.bodies])
+        result: Array = at[:, 0] - at[:, 1]
+        return result
 
-    def largest_of_islands(self, values: Array) -> Array:
-        """The largest value at the contacts of each island, none below 0, (islands,), of (k,)."""
-        largest = np.zeros(int(self.islands.max(initial=-1)) + 1)
-        np.maximum.at(largest, self.islands, values)
-        return largest
+    def along_normals(self, of_bodies: Array) -> Array:
+        """Of these velocities that along the normals [m/s], (k,)."""
+        return np.einsum("ki,ki->k", self.normal, self.velocities(of_bodies))
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Impulses and how they were found."""
 
-    impulses: Array  # along the axes of the contacts [N s], (k, 3)
-    change: Array  # of the velocities (v, omega) of the moving bodies by them, (n, 6)
+    impulses: Array  # [N s], (k, 3)
+    velocity: Array  # (v, omega) of all bodies with them [m/s], [rad/s], (n + 1, 6)
+    along_normals: Array  # relative velocities along the normals [m/s], (k,)
     iterations: int  # sweeps over all contacts of the island that took most
     converged: bool  # whether the last sweep changed less than the tolerance, in all islands
+    joint_impulses: Array  # those of joints, (r,), or none where these ask nothing
 
 
 def solve_velocities(
-    system: ContactSystem, free: Array, *, least_normal: Array, friction: Array, start: Array, tolerance: Array
+    system: ContactSystem,
+    velocity: Array,
+    *,
+    least_normal: Array,
+    friction: Array,
+    start: Array,
+    relative_tolerance: float,
+    tolerance: float,
+    lowest: Array | None = None,
+    most: NDArray[np.int32] | None = None,
+    joints: JointDemand | None = None,
 ) -> Solution:
-    """Impulses with w_n >= least_normal, λ_n >= 0, complementary, and Coulomb friction |λ_t| <= mu λ_n.
+    """Impulses with w_n >= least_normal, λ_n >= lowest, complementary, and Coulomb friction |λ_t| <= mu λ_n.
 
     Sweeps over contacts, there and back; of each, first the normal impulse, then both tangential ones exactly for that
     normal one (nonsmooth Gauss-Seidel; Jean 1999, "The non-smooth contact dynamics method"): they stop the slip if
@@ -104,92 +117,68 @@ def solve_velocities(
 
     Args:
         system: of the contacts.
-        free: velocities at the contacts without their impulses [m/s], (k, 3).
+        velocity: (v, omega) of all bodies without the impulses of these contacts [m/s], [rad/s], (n + 1, 6).
         least_normal: lower bound of the normal velocities [m/s], (k,).
         friction: coefficients mu [-], (k,).
         start: impulses to start from [N s], (k, 3).
-        tolerance: largest change of a contact velocity in the last sweep of each island [m/s], (islands,).
+        relative_tolerance: largest change of a contact velocity in the last sweep, in the largest one of the island.
+        tolerance: what may change besides [m/s].
+        lowest: lower bounds of the normal impulses [N s], (k,); 0 if omitted.
+        most: sweeps of each island, (islands,); if omitted, the most that there are.
+        joints: what joints ask, of which those in islands with contacts are solved.
     """
-    bias = free.copy()
-    bias[:, 0] -= least_normal
-    return _sweep(system, bias, np.zeros(len(free)), friction, _admissible(start, friction), tolerance)
+    from sim.rigid.contact_kernels import COLUMNS, System, sweep_islands, sweep_jointed_islands
+    from sim.rigid.joint_kernels import IMPULSE
 
-
-def solve_positions(
-    system: ContactSystem, wanted: Array, *, two_sided: NDArray[np.bool_], tolerance: Array
-) -> Solution:
-    """Normal impulses of a motion that moves bodies apart and leaves their velocities alone.
-
-    Args:
-        system: of the contacts.
-        wanted: normal velocities of that motion [m/s], (k,): at least so much, or just so much.
-        two_sided: contacts that get just that, (k,).
-        tolerance: largest change of a contact velocity in the last sweep of each island [m/s], (islands,).
-    """
-    k = len(wanted)
-    bias = np.zeros((k, 3))
-    bias[:, 0] = -wanted
-    return _sweep(system, bias, np.where(two_sided, -LARGEST_IMPULSE, 0.0), np.zeros(k), np.zeros((k, 3)), tolerance)
-
-
-def tangent_basis(normal: Array) -> Array:
-    """Two unit tangents a normal, (k, 2, 3), that depend on it continuously but at one pole (Duff et al. 2017)."""
-    x, y, z = normal.T
-    sign = np.where(z < 0.0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    tangents = np.empty((len(normal), 2, 3))
-    tangents[:, 0, 0], tangents[:, 0, 1], tangents[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    tangents[:, 1, 0], tangents[:, 1, 1], tangents[:, 1, 2] = b, sign + y * y * a, -y
-    return tangents
-
-
-def _sweep(
-    system: ContactSystem, bias: Array, lowest: Array, friction: Array, impulses: Array, tolerance: Array
-) -> Solution:
-    """Impulses from those given on, which are overwritten."""
-    from sim.rigid.contact_kernels import System, sweep_islands
-
-    k = len(bias)
+    k = len(least_normal)
     order = np.argsort(system.islands, kind="stable").astype(np.int32)
-    first = np.concatenate([[0], np.cumsum(np.bincount(system.islands))]).astype(np.int32)
-    change, sweeps = np.zeros((system.body_count, 6)), np.zeros(len(first) - 1, dtype=np.int32)
-    sweep_islands(
-        order,
-        first,
-        System(
-            system.movers,
-            system.jacobian.reshape(k, 36),
-            system.response.reshape(k, 36),
-            system.own,
-            bias,
-            lowest,
-            friction,
-        ),
-        tolerance,
-        MAX_ITERATIONS,
-        impulses,
-        change,
-        np.empty((k, 6)),
-        sweeps,
+    sizes = np.bincount(system.islands)
+    first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+    most = np.full(len(sizes), MAX_ITERATIONS, dtype=np.int32) if most is None else most
+    sweeps = np.zeros(len(sizes), dtype=np.int32)
+    lowest = np.zeros(k) if lowest is None else lowest
+    impulses, velocity, along_normals = start.copy(), velocity.copy(), np.empty(k)
+    contacts = System(
+        system.bodies, system.point, system.normal, least_normal, lowest, friction, system.position, system.ease
     )
-    most = int(sweeps.max())
-    return Solution(impulses, change, min(most, MAX_ITERATIONS), most <= MAX_ITERATIONS)
+    found = (relative_tolerance, tolerance, most, impulses, velocity, along_normals, np.empty((k, COLUMNS)), sweeps)
+    by_joints = NO_IMPULSES
+    if joints is None:
+        sweep_islands(order, first, contacts, *found)
+    else:
+        rows = joints.rows()
+        sweep_jointed_islands(order, first, contacts, *_joints_of_islands(system, joints), rows, *found)
+        by_joints = rows.numbers[:, IMPULSE].copy()
+    taken = int(sweeps.max())
+    converged = bool(np.all((sweeps <= most) | (most < MAX_ITERATIONS)))
+    return Solution(impulses, velocity, along_normals, min(taken, MAX_ITERATIONS), converged, by_joints)
 
 
-def _islands(movers: NDArray[np.int32], n: int) -> Indices:
-    """Numbers of the groups of contacts, (k,), that bodies which impulses move link."""
-    linking = (movers >= 0).all(axis=1)
-    first, second = movers[linking].T
-    links = coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(n, n))
-    group = connected_components(links, directed=False)[1]
-    return np.unique(group[movers.max(axis=1)], return_inverse=True)[1].astype(np.int64)
+def _islands(bodies: NDArray[np.int32], moves: NDArray[np.bool_], links: Indices) -> Indices:
+    """Numbers of the groups of contacts, (k,), that joints, and bodies, (n + 1,), which impulses move, link."""
+    first, second = bodies.T
+    group = _groups(bodies, moves, links)
+    return np.unique(group[np.where(moves[first], first, second)], return_inverse=True)[1].astype(np.int64)
 
 
-def _admissible(impulses: Array, friction: Array) -> Array:
-    """Impulses with the normal one not negative and the tangential ones within friction."""
-    normal = np.maximum(impulses[:, 0], 0.0)
-    size = np.sqrt(np.square(impulses[:, 1:]).sum(axis=1))
-    limit = friction * normal
-    share = np.divide(limit, size, out=np.ones_like(size), where=size > limit)
-    return np.concatenate([normal[:, None], share[:, None] * impulses[:, 1:]], axis=1)
+def _groups(bodies: NDArray[np.int32], moves: NDArray[np.bool_], links: Indices) -> Indices:
+    """Number of the group of each body, (n + 1,), that contacts and joints link."""
+    first, second = np.concatenate([bodies[moves[bodies].all(axis=1)], links]).T
+    shape = (len(moves), len(moves))
+    linked = coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape)
+    return connected_components(linked, directed=False)[1].astype(np.int64)
+
+
+def _joints_of_islands(system: ContactSystem, joints: JointDemand) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Components of joints, island after island, and where those of each island begin; others are left out."""
+    moves = system.ease[:, 0] > 0.0
+    groups = _groups(system.bodies, moves, system.links)
+    first, second = system.bodies.T
+    island_of = np.full(len(moves), -1)
+    island_of[groups[np.where(moves[first], first, second)]] = system.islands
+    elimination, movers = joints.system.elimination, joints.system.movers.max(axis=1)
+    island, moved = np.full(len(elimination.components), -1), movers >= 0
+    island[elimination.component[moved]] = island_of[groups[movers[moved]]]
+    order = np.argsort(island, kind="stable").astype(np.int32)
+    begins = np.searchsorted(island[order], np.arange(int(system.islands.max()) + 2)).astype(np.int32)
+    return order, begins

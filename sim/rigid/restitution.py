@@ -9,8 +9,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
+from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, Solution, solve_velocities
 from sim.rigid.contacts import Array, Contacts, Indices
+from sim.rigid.joint_system import JointDemand
 from sim.rigid.states import MovingBodies
 
 SLOWEST_BOUNCE = 0.02  # approach below which nothing bounces [m/s]; or two steps of gravity
@@ -92,12 +93,13 @@ class Bounces:
 
 def solve_impacts(
     system: ContactSystem,
-    free: Array,
+    velocity: Array,
     *,
     bounces: Bounces,
     least_normal: Array,
     friction: Array,
-    tolerance: Array,
+    tolerance: float,
+    joints: JointDemand | None = None,
 ) -> Solution:
     """Impulses with Newton's restitution, as far as energy allows; arguments as those of `solve_velocities`.
 
@@ -112,10 +114,18 @@ def solve_impacts(
 
     λ is between two solutions: it pushes only, stays within friction and lets nothing approach, which are all convex.
     Without friction E(1) is just the bound, as it is for all central impacts, so that Newton's law holds there. Each
-    group of bodies that touch has its own s.
+    group of bodies that touch has its own s. Joints, which do no work, hold throughout.
     """
-    solve = partial(solve_velocities, system, free, friction=friction, tolerance=tolerance)
-    nothing = np.zeros_like(free)
+    solve = partial(
+        solve_velocities,
+        system,
+        velocity,
+        friction=friction,
+        relative_tolerance=RELATIVE_TOLERANCE,
+        tolerance=tolerance,
+        joints=joints,
+    )
+    nothing = np.zeros((len(least_normal), 3))
     compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=nothing)
     before = compression.impulses
     newton = solve(
@@ -124,11 +134,11 @@ def solve_impacts(
     )
     islands = system.islands
     step = newton.impulses - before
-    fall = np.stack([bounces.fall, np.zeros_like(bounces.fall), np.zeros_like(bounces.fall)], axis=1)
     # Mean velocity while an impulse acts, at the instant of the impact.
-    mean_before = free + 0.5 * system.velocities(compression.change) - fall
-    change_of_bodies = newton.change - compression.change
+    mean_before = 0.5 * system.velocities(velocity + compression.velocity) - bounces.fall[:, None] * system.normal
+    change_of_bodies = newton.velocity - compression.velocity
     change = system.velocities(change_of_bodies)
+    pressing = np.einsum("ki,ki->k", before, system.normal) * np.einsum("ki,ki->k", mean_before, system.normal)
     work_before, linear, quadratic = (
         np.bincount(islands, weights=terms)
         for terms in (
@@ -137,20 +147,40 @@ def solve_impacts(
             0.5 * np.sum(step * change, axis=1),
         )
     )
-    returned = -np.bincount(islands, weights=bounces.restitution**2 * before[:, 0] * mean_before[:, 0])
+    returned = -np.bincount(islands, weights=bounces.restitution**2 * pressing)
     most = np.maximum(np.minimum(work_before + returned, 0.0), work_before)
     share = np.array([_largest_share(*each) for each in zip(most - work_before, linear, quadratic, strict=True)])
     # Of bodies that no impulse moves nothing changes, whatever their share.
-    share_of_bodies = np.zeros(system.body_count)
+    share_of_bodies, moves = np.zeros(len(velocity)), system.moves
     for side in range(2):
-        moves = system.movers[:, side] >= 0
-        share_of_bodies[system.movers[moves, side]] = share[islands[moves]]
+        share_of_bodies[system.bodies[moves[:, side], side]] = share[islands[moves[:, side]]]
+    by_joints = compression.joint_impulses
+    if joints is not None:
+        share_of_bodies, share_of_rows = _shares_with_joints(share_of_bodies, joints)
+        by_joints = by_joints + share_of_rows * (newton.joint_impulses - by_joints)
     return Solution(
         before + share[islands][:, None] * step,
-        compression.change + share_of_bodies[:, None] * change_of_bodies,
+        compression.velocity + share_of_bodies[:, None] * change_of_bodies,
+        newton.along_normals,
         compression.iterations + newton.iterations,
         compression.converged and newton.converged,
+        by_joints,
     )
+
+
+def _shares_with_joints(share_of_bodies: Array, joints: JointDemand) -> tuple[Array, Array]:
+    """The shares of all bodies, (n + 1,), with those that joints alone move, and of rows of joints, (r,).
+
+    All bodies of a component of joints are of one island, and at least one of those that contacts move knows its share.
+    """
+    movers, elimination = joints.system.movers, joints.system.elimination
+    of_components, shares = np.zeros(len(elimination.components)), share_of_bodies.copy()
+    sides = [(movers[:, side][movers[:, side] >= 0], elimination.component[movers[:, side] >= 0]) for side in range(2)]
+    for moved, component in sides:
+        np.maximum.at(of_components, component, share_of_bodies[moved])
+    for moved, component in sides:
+        shares[moved] = of_components[component]
+    return shares, of_components[elimination.component]
 
 
 def _largest_share(room: float, linear: float, quadratic: float) -> float:

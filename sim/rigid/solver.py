@@ -18,6 +18,9 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
+from sim.rigid.contacts import Indices
+from sim.rigid.joint_parameters import JointParameters
+from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies, rotate_freely
@@ -54,7 +57,7 @@ class RigidSolver:
     bounce, changes the angular momentum of the pair by some 1e-5 of itself. Restitution is Newton's, of normal
     velocities, where Stronge's, of energy, allows it (`restitution`): impulses never add energy. Bringing corners to
     where their bounce leads within a step may lift a body: up to 0.3 % of its energy at a restitution of 1, to first
-    order in the step. Unsupported: rolling friction, joints.
+    order in the step. Unsupported: rolling friction. Joints: `joints.Joints`.
 
     Attributes:
         bodies: state of the moving bodies.
@@ -62,6 +65,7 @@ class RigidSolver:
         all_names, all_geometries: of the moving bodies, then of the static ones.
         surfaces: friction and restitution of all of these.
         walls: closed faces of the domain.
+        joints: between the bodies, or None.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
         has_own_steps: whether fast bodies divide the step of all; nothing that is coupled to them shares it then.
 
@@ -74,6 +78,7 @@ class RigidSolver:
         parameters: Sequence[RigidBodyParameters],
         *,
         obstacles: Sequence[RigidBodyParameters] = (),
+        joints: Sequence[JointParameters] = (),
         domain: DomainParameters,
         gravity: Vector3,
     ) -> None:
@@ -100,6 +105,8 @@ class RigidSolver:
         self._response = ContactResponse(self.surfaces, self.gravity)
         corners = np.array([domain.min, domain.max])
         self._chooser = StepChooser(self.all_geometries, self.bodies, self.walls, self._detector, self.gravity)
+        self.joints = Joints(joints, everybody, self.bodies) if joints else None
+        self._obey_joints()
         self.has_own_steps = False
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
@@ -114,6 +121,21 @@ class RigidSolver:
             np.concatenate([self.bodies.position, self._fixed_position]),
             np.concatenate([self.bodies.rotation(), self._fixed_rotation]),
         )
+
+    def mobility(self) -> tuple[Array, Array]:
+        """How easily impulses move bodies: inverse masses [1/kg], (n,), and inertia tensors in world axes, (n, 3, 3).
+
+        Of what joints hold to something that stands or is led, as far as they let it; joints between free bodies are
+        not foreseen.
+        """
+        inverse_mass, inverse_inertia = self.bodies.inverse_mass, self.bodies.inverse_inertia()
+        if self.joints is not None:
+            self.joints.reduce_mobility(self.bodies, inverse_mass, inverse_inertia)
+        return inverse_mass, inverse_inertia
+
+    def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
+        """Those of some pairs of bodies, the lower number first, that no joint keeps from touching, (p,) each."""
+        return self._detector.touching(first, second)
 
     def max_surface_speed(self) -> float:
         """Upper bound of the speed of any surface point [m/s]."""
@@ -162,15 +184,31 @@ class RigidSolver:
         reach = self._with_obstacles(np.where(moves, dt * self._surface_speeds(), 0.0))
         among = np.append(is_active, np.zeros(len(self._fixed_position) - 1, dtype=bool))
         contacts = self._detector.find(self.poses(), reach, self._response.last_keys, among)
-        outcome = self._response.resolve(contacts, bodies, dt, is_active)
+        inverse_inertia, joints = bodies.inverse_inertia(), self.joints
+        step = None if joints is None else joints.begin(bodies, dt, is_active, inverse_inertia)
+        outcome = self._response.resolve(contacts, bodies, dt, is_active, inverse_inertia, joints, step)
         self._contact_count = len(contacts)
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
         self._max_penetration = max(self._max_penetration, -float(np.min(contacts.gap, initial=0.0)))
 
+        is_touched = outcome.is_touched | (bodies.is_pushed & is_active)
+        hold = None
+        if joints is not None and step is not None:
+            extra = np.concatenate([outcome.extra_velocity, outcome.extra_angular_velocity], axis=1)
+            hold = joints.hold(
+                step,
+                bodies,
+                outcome.joint_impulses,
+                is_touched,
+                gravity=self.gravity,
+                extra=extra,
+                is_held=outcome.is_held,
+            )
+
         # A body in free flight moves by the mean of its velocities, which is exact; one in contact by the new one,
         # which is what the contacts allow, and so does one that a fluid pushed: the fluid is to see how it moves.
-        flying = free & ~(outcome.is_touched | bodies.is_pushed)[:, None]
+        flying = free & ~is_touched[:, None]
         bodies.is_pushed = bodies.is_pushed & ~is_active
         velocity = bodies.velocity - np.where(flying, 0.5 * dt * self.gravity, 0.0)
         bodies.position = bodies.position + dt * np.where(free, velocity + outcome.extra_velocity, 0.0)
@@ -186,6 +224,17 @@ class RigidSolver:
         rotate_freely(bodies, dt, is_active)
         self._place_kinematic_bodies(time_s + dt)
         self._detector.follow(self._with_obstacles(self._surface_motion_since(*before)))
+        if joints is not None and hold is not None:
+            broken = int(joints.is_broken.sum())
+            joints.settle(hold, bodies, is_active, bodies.inverse_inertia())
+            if int(joints.is_broken.sum()) > broken:
+                self._obey_joints()
+
+    def _obey_joints(self) -> None:
+        """Tell who looks for contacts, and who chooses steps, what joints hold together now."""
+        if self.joints is not None:
+            self._detector.untouching = self.joints.untouching()
+            self._chooser.links = self.joints.links()
 
     def _awake(self, dt: float) -> NDArray[np.bool_]:
         """Bodies that do not sleep, (n,), after those were woken that what moves may meet in dt [s], and so on."""
@@ -197,6 +246,8 @@ class RigidSolver:
             meetings = self._chooser.meetings(self.poses(), dt, moves)
             met = np.zeros(len(self.all_geometries), dtype=bool)
             met[meetings.first] = met[meetings.second] = True
+            if self.joints is not None:
+                met[: len(bodies)] |= self.joints.beside(moves)
             woken = met[: len(bodies)] & bodies.is_asleep
             if not woken.any():
                 break
@@ -214,9 +265,13 @@ class RigidSolver:
             return
         first, second = (np.minimum(numbers, n) for numbers in self._detector.near())
         free, leads = np.append(awake, False), np.append(~bodies.is_dynamic & (speeds > 0.0), False)
+        if self.joints is not None:
+            first, second = (np.concatenate(each) for each in zip((first, second), self._chooser.links, strict=True))
         links = free[first] & free[second]
         groups = groups_of(first[links], second[links], n)
         restless = np.zeros(n, dtype=bool)
+        if self.joints is not None:
+            restless[groups[self.joints.driven()]] = True
         np.logical_or.at(restless, groups, awake & ~rests)
         for one, two in ((first, second), (second, first)):
             restless[groups[one[free[one] & leads[two]]]] = True
@@ -227,6 +282,8 @@ class RigidSolver:
         self.time_s = time_s
         self._contact_count = self._iterations = self._not_converged = 0
         self._max_penetration = 0.0
+        if self.joints is not None:
+            self.joints.begin_frame()
 
     def lead(self, name: str, position: Vector3, *, rotation_deg: Vector3 | None = None, within_s: float) -> None:
         """Lead a kinematic body on, between frames; no checkpoint, nor what `path_onwards` names, knows of it."""
@@ -356,6 +413,7 @@ class RigidSolver:
             **{name: getattr(self.bodies, name).copy() for name in _STATE},
             **self._detector.checkpoint(),
             **self._response.checkpoint(),
+            **({} if self.joints is None else self.joints.checkpoint()),
             "clock": np.array([self.time_s]),
         }
 
@@ -368,6 +426,9 @@ class RigidSolver:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}, got {found}")
         self._detector.restore(arrays)
         self._response.restore(arrays)
+        if self.joints is not None:
+            self.joints.restore(arrays)
+            self._obey_joints()
         for name in _STATE:
             setattr(self.bodies, name, np.array(arrays[name], dtype=getattr(self.bodies, name).dtype))
         self.time_s = float(arrays["clock"][0])
@@ -378,6 +439,7 @@ class RigidSolver:
         `angular_momentum_*` [kg m²/s] is about the world's origin, `potential_energy` [J] is zero there; `contacts`
         is their number in the last substep, of bodies that do not sleep, `max_penetration` [m] the worst of the frame,
         `iterations` their sum over the frame, `bodies_lost` the number of bodies stopped far outside of the domain.
+        Of joints see `Joints.diagnostics`.
         """
         bodies, free = self.bodies, self.bodies.is_free
         mass = bodies.mass[free]
@@ -385,6 +447,7 @@ class RigidSolver:
         spin = bodies.angular_momentum()[free]
         angular = spin + np.cross(bodies.position[free], momentum)
         kinetic = 0.5 * (np.sum(momentum * bodies.velocity[free]) + np.sum(spin * bodies.angular_velocity[free]))
+        of_joints = {} if self.joints is None else self.joints.diagnostics()
         return {
             "mass": float(mass.sum()),
             **_by_axis("momentum", momentum.sum(axis=0)),
@@ -397,6 +460,7 @@ class RigidSolver:
             "iterations": float(self._iterations),
             "not_converged": float(self._not_converged),
             "bodies_lost": float(np.count_nonzero(bodies.is_lost)),
+            **of_joints,
         }
 
     def remedies(self) -> Remedies:

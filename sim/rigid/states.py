@@ -149,19 +149,29 @@ def rotate_freely(bodies: MovingBodies, dt: float, which: NDArray[np.bool_]) -> 
     The spin in world axes is carried over as it is; the angular velocity follows from it.
     """
     spin = bodies.angular_momentum()
-    q = rotation.product(bodies.orientation, bodies.principal_orientation)
+    q = turned_freely(bodies.orientation, bodies.principal_orientation, bodies.principal_moments, spin, dt)
+    bodies.orientation = np.where(which[:, None], q, bodies.orientation)
+    bodies.set_angular_momentum(spin, which)
+
+
+def turned_freely(
+    orientation: Array, principal_orientation: Array, principal_moments: Array, spin: Array, dt: float
+) -> Array:
+    """Orientations, (n, 4), after dt [s] without torque, of bodies with spins in world axes [kg m²/s], (n, 3).
+
+    The principal axes are given in body axes, (n, 4), with their moments [kg m²], (n, 3).
+    """
+    q = rotation.product(orientation, principal_orientation)
     in_body = np.einsum("nji,nj->in", rotation.matrices(q), spin)
     for axis, share in _SEQUENCE:
-        angle = share * dt * in_body[axis] / bodies.principal_moments[:, axis]
+        angle = share * dt * in_body[axis] / principal_moments[:, axis]
         c, s = np.cos(0.5 * angle), np.sin(0.5 * angle)
         q = c[:, None] * q + s[:, None] * (_SIGNS[axis] * q[:, _COMPONENTS[axis]])
         # Seen from the turned body, its spin turns backwards.
         cosine, sine = c * c - s * s, 2.0 * c * s
         j, k = (axis + 1) % 3, (axis + 2) % 3
         in_body[j], in_body[k] = cosine * in_body[j] + sine * in_body[k], cosine * in_body[k] - sine * in_body[j]
-    q = rotation.normalized(rotation.product(q, rotation.conjugate(bodies.principal_orientation)))
-    bodies.orientation = np.where(which[:, None], q, bodies.orientation)
-    bodies.set_angular_momentum(spin, which)
+    return rotation.normalized(rotation.product(q, rotation.conjugate(principal_orientation)))
 
 
 class StaticBody:

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
-from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.broad_phase import NearBoxes
 from sim.rigid.collision import CONTACT_BAND, TRUSTED_MOTION, CollisionDetector
 from sim.rigid.contacts import Array, Indices
 from sim.rigid.states import MovingBodies
@@ -38,7 +38,11 @@ class Meetings:
 
 
 class StepChooser:
-    """How long steps of bodies may be; gravity is in m/s²."""
+    """How long steps of bodies may be; gravity is in m/s².
+
+    Attributes:
+        links: pairs of moving bodies that joints hold together, (l,) each: they take the same steps.
+    """
 
     def __init__(
         self,
@@ -54,7 +58,9 @@ class StepChooser:
         self._radius = np.array([geometry.radius for geometry in geometries])
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
+        self._boxes = NearBoxes()
         self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
+        self.links = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
     def meetings(self, poses: Poses, dt: float, is_active: NDArray[np.bool_], speeds: Array | None = None) -> Meetings:
         """The meetings of active bodies, (n,), within dt [s]; speeds of surfaces [m/s], (n,), their own if omitted."""
@@ -67,7 +73,8 @@ class StepChooser:
         reach = (motion + (CONTACT_BAND + TRUSTED_MOTION) * self._edge)[:, None]
         lower, upper = self._detector.boxes(poses)
         among = np.append(is_active, np.zeros(len(self._edge) - n, dtype=bool))
-        first, second = overlapping_pairs(lower - reach, upper + reach, among)
+        boxes = self._boxes.overlapping(lower - reach, upper + reach, motion, among)
+        first, second = self._detector.touching(*boxes)
 
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
         turning = np.append(spin, np.zeros(len(self._edge) - n)) * self._radius
@@ -128,8 +135,11 @@ class StepChooser:
         """The group of each body, and how many steps it takes in dt [s], (n,) each."""
         n = len(is_free)
         free = np.append(is_free, np.zeros(len(self._edge) - n, dtype=bool))
-        links = free[meetings.first] & free[meetings.second]
-        groups = groups_of(meetings.first[links], meetings.second[links], n)
+        first, second = (
+            np.concatenate(each) for each in zip((meetings.first, meetings.second), self.links, strict=True)
+        )
+        links = free[first] & free[second]
+        groups = groups_of(first[links], second[links], n)
         time_s = np.full(n, np.inf)
         np.minimum.at(time_s, groups[is_free], meetings.alone_s[is_free])
         for one, two in ((meetings.first, meetings.second), (meetings.second, meetings.first)):

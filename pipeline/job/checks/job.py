@@ -11,6 +11,7 @@ from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.kinds.base import Kind
 from pipeline.kinds.checks.memory_budget import MemoryBudget, memory_budget
+from pipeline.kinds.checks.rigid import check_joints
 from pipeline.kinds.checks.shapes import build_solids, in_scale
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.table import KINDS, bodies, described_material, is_meant, placements
@@ -36,6 +37,7 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
     """
     findings = Findings()
     _check_bodies(job, findings)
+    check_joints(job, findings)
     _check_whitewater(job, findings)
     _check_materials(job, findings)
     _check_dye(job, findings)

@@ -64,7 +64,7 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
-    example, pouring, cloth, smoke, limits = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    example, pouring, joints, cloth, smoke, limits = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")
@@ -73,6 +73,15 @@ def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     poured = example.replace("[[rigid]]", f"{pouring}\n{jug}\n[[rigid]]", 1)
     (tmp_path / "poured.toml").write_text(poured)
     assert load_job(tmp_path / "poured.toml").fluid[0].emitter[0].follow == "jug"
+    bodies = [
+        f'[[rigid]]\nname = "{name}"\nkind = "dynamic"\ndensity = 500.0\n'
+        f'shape = {{ type = "sphere", radius = 0.1 }}\nposition = [{x}, 0.0, 0.24]\n'
+        for name, x in (("wheel", -0.3), ("car", 0.1), ("trailer", 0.4))
+    ]
+    (tmp_path / "joined.toml").write_text(f'name = "joined"\n{joints}{"".join(bodies)}')
+    loaded, findings = load_checked_job(tmp_path / "joined.toml")
+    assert [joint.name for joint in loaded.job.joint] == ["axle", "tow"]
+    assert findings.warnings == []
     (tmp_path / "flag.toml").write_text(f'name = "flag"\n{cloth}')
     assert len(load_job(tmp_path / "flag.toml").cloth[0].pin) == 2
     car = '[[rigid]]\nname = "car"\nshape = { type = "box", size = [0.4, 0.2, 0.1] }\nposition = [0.0, 0.2, 0.1]\n'

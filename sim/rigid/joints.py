@@ -1,0 +1,565 @@
+"""Joints between rigid bodies: what they hold, limit, drive and pull, and when they break."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.core.motion import rotation
+from sim.core.solver import Arrays, Diagnostics
+from sim.rigid.contacts import Array, Indices, pair_keys
+from sim.rigid.joint_order import elimination_of
+from sim.rigid.joint_parameters import JointParameters, points_of
+from sim.rigid.joint_system import UNBOUNDED, JointDemand, JointSystem, solve_alone
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.states import MovingBodies, turned_freely
+
+POINT, ACROSS, ALONG, LENGTH, TURN, ALIGN, ANGLE, SWING = range(8)
+"""What a row is about: the way between the two points; its parts across and along the axis; its length; the turn of one
+body against the other; the axis of one across that of the other; the angle about it; the angle between both."""
+
+HOLDS, LIMITS, DRIVES, PULLS = range(4)
+"""What a row does with it: keeps it at 0; not below 0; lets it change at a speed, as far as the motor can; pulls it to
+0 as a spring does."""
+
+MOST_STEPS = 20  # of Newton's method to where the joints hold at the end of a step
+HELD = 1.0e-9  # change of a gap [m], [rad] by which these steps end: what is left is far less
+APART = 1.0e-6  # error that no impulse changes: what joints ask for is more than there is to move [m], [rad]
+CLOSING_SHARE = 0.2  # of an error at the start of a step that is taken back in it
+TOUCHING = 1.0e-6  # a limit nearer than this counts as reached in an impact [m], [rad]
+REDUNDANT = 1.0e-9  # of the largest: rows of one body with smaller eigenvalues say what others say
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """Where the joints are: (j, ...)."""
+
+    ends: Array  # the two points [m], (j, 2, 3)
+    centres: Array  # of mass of the two bodies [m], (j, 2, 3)
+    axis: Array  # on the second body, (j, 3)
+    own_axis: Array  # on the first body, (j, 3)
+    tangents: Array  # across the axis of the second body, (j, 2, 3)
+    turn: Array  # of the first body against the second since the start [rad], (j, 3)
+    angle: Array  # of a hinge [rad], (j,)
+
+
+@dataclass(frozen=True, eq=False)
+class JointStep:
+    """The joints at the start of a step."""
+
+    system: JointSystem
+    values: Array  # of all rows, (r,)
+    dt: float  # [s]
+    velocity: Array  # of the bodies before their impulses, (n, 6)
+    speeds: Array  # that motors want, (r,), 0 elsewhere
+
+
+class Joints:
+    """All joints of a scene; the bodies that move are numbered as in `MovingBodies`, and n is all that stands.
+
+    Where nothing touches, a step is one of RATTLE (Andersen 1983; for bodies that turn freely in between, Reich 1996):
+    impulses at its start hold the joints at its end, and impulses at its end hold their velocities; it is of second
+    order, keeps momenta, and the energy without drift. Springs have the mean force of both ends, with which they swing
+    on for ever. Bodies of a component that contacts or a fluid pushed take the velocity that joints and contacts find
+    together for the whole step, as bodies in contact do, and the joints hold at its end as well.
+
+    Attributes:
+        names: (j,).
+        is_broken: (j,).
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[JointParameters],
+        everybody: Sequence[RigidBodyParameters],
+        bodies: MovingBodies,
+    ) -> None:
+        """Take the joints of a scene, without problems, and its bodies where they start."""
+        self.names, self._parameters, self._n = (
+            tuple(joint.name for joint in parameters),
+            tuple(parameters),
+            len(bodies),
+        )
+        numbers = {body.name: number for number, body in enumerate(everybody)}
+        named = np.array([[numbers.get(name, -1) for name in (*joint.between, None)[:2]] for joint in parameters])
+        self._named = np.where(named < 0, len(everybody), named)
+        self._bodies = np.minimum(self._named, self._n)  # (j, 2)
+        self.is_broken = np.zeros(len(parameters), dtype=bool)
+        self._touches = np.array([joint.contacts for joint in parameters])
+        self._members = np.unique(self._bodies[self._bodies < self._n])
+        self._place(parameters, everybody, bodies)
+        self._make_rows(parameters)
+        self._order = elimination_of(self._bodies, self._counts, np.append(bodies.is_dynamic, False))
+        row = self._first_rows[self._order.joint] + self._order.number
+        self._joint, self._about, self._part, self._sign, self._offset, self._does = (
+            self._joint[row],
+            self._about[row],
+            self._part[row],
+            self._sign[row],
+            self._offset[row],
+            self._does[row],
+        )
+        self._row_bodies = self._bodies[self._joint]
+        self._is_linear = self._about <= LENGTH
+        stiffness = np.array([joint.stiffness or 0.0 for joint in parameters])
+        self._stiffness, self._damping = stiffness[self._joint], np.array([j.damping for j in parameters])[self._joint]
+        self._set_motors(parameters)
+        self._breaks_at = np.array([joint.breaks_at or np.inf for joint in parameters])
+        self._breaks_at_torque = np.array([joint.breaks_at_torque or np.inf for joint in parameters])
+        self.begin_frame()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def _place(
+        self, parameters: Sequence[JointParameters], everybody: Sequence[RigidBodyParameters], bodies: MovingBodies
+    ) -> None:
+        """Fix points and axes to the bodies."""
+        points = np.array([points_of(joint, everybody) for joint in parameters], dtype=np.float64)
+        axes = np.array([joint.axis or (0.0, 0.0, 1.0) for joint in parameters], dtype=np.float64)
+        axes /= np.sqrt(np.square(axes).sum(axis=1))[:, None]
+        position, orientation = self._with_world(bodies.position, bodies.orientation)
+        first, second = self._bodies.T
+        inverse = rotation.conjugate(orientation[self._bodies])
+        # The point of each body, its axis, and tangents across that.
+        own = np.empty((len(parameters), 2, 4, 3))
+        own[:, :, 0], own[:, :, 1] = points - position[self._bodies], axes[:, None]
+        own[:, :, 2:] = _across(axes)[:, None]
+        self._own = rotation.rotated(inverse[:, :, None], own)
+        self._turn = rotation.product(rotation.conjugate(orientation[second]), orientation[first])
+        self._angle = np.zeros(len(parameters))
+        lengths = np.sqrt(np.square(points[:, 0] - points[:, 1]).sum(axis=1))
+        given = np.array([np.nan if joint.length is None else joint.length for joint in parameters])
+        self._length = np.where(np.isnan(given), lengths, given)
+        for number, joint in enumerate(parameters):
+            if joint.kind == "distance":
+                self._length[number] = lengths[number]
+
+    def _make_rows(self, parameters: Sequence[JointParameters]) -> None:
+        """The rows of each joint: whose, about what, which part of it, its sign, where it is 0, and what it does."""
+        rows: list[tuple[int, int, int, float, float, int]] = []
+        self._counts: list[int] = []
+        for number, joint in enumerate(parameters):
+            own: list[tuple[int, int, float, float, int]] = []
+            if joint.kind in ("fixed", "hinge", "ball"):
+                own += [(POINT, part, 1.0, 0.0, HOLDS) for part in range(3)]
+            if joint.kind == "slider":
+                own += [(ACROSS, part, 1.0, 0.0, HOLDS) for part in range(2)]
+            if joint.kind in ("fixed", "slider"):
+                own += [(TURN, part, 1.0, 0.0, HOLDS) for part in range(3)]
+            if joint.kind == "hinge":
+                own += [(ALIGN, part, 1.0, 0.0, HOLDS) for part in range(2)]
+            if joint.kind in ("distance", "spring"):
+                own.append((LENGTH, 0, 1.0, self._length[number], HOLDS if joint.kind == "distance" else PULLS))
+            if joint.kind == "rope":
+                own.append((LENGTH, 0, -1.0, self._length[number], LIMITS))
+            if joint.cone_deg is not None:
+                own.append((SWING, 0, -1.0, float(np.radians(joint.cone_deg)), LIMITS))
+            free = ANGLE if joint.kind == "hinge" else ALONG
+            for limits in (joint.limits, np.radians(joint.limits_deg) if joint.limits_deg else None):
+                if limits is not None:
+                    own += [(free, 0, 1.0, float(limits[0]), LIMITS), (free, 0, -1.0, float(limits[1]), LIMITS)]
+            if joint.motor is not None:
+                own.append((free, 0, 1.0, 0.0, DRIVES))
+            rows += [(number, *row) for row in own]
+            self._counts.append(len(own))
+        self._first_rows = np.concatenate([[0], np.cumsum(self._counts)]).astype(np.int64)
+        table = np.array(rows, dtype=np.float64)
+        self._joint, self._about, self._part = (table[:, column].astype(np.int64) for column in range(3))
+        self._sign, self._offset, self._does = table[:, 3], table[:, 4], table[:, 5].astype(np.int64)
+
+    def _set_motors(self, parameters: Sequence[JointParameters]) -> None:
+        """What motors want, by row: a speed, or to be somewhere; and what they can."""
+        count = len(self._joint)
+        self._speed, self._goal, self._response = np.zeros(count), np.full(count, np.nan), np.ones(count)
+        self._strength = np.zeros(count)
+        for row in np.flatnonzero(self._does == DRIVES):
+            motor = parameters[self._joint[row]].motor
+            assert motor is not None
+            self._strength[row] = motor.max_torque or motor.max_force
+            self._response[row] = motor.response_s
+            if motor.speed is not None:
+                self._speed[row] = motor.speed
+            else:
+                self._goal[row] = np.radians(motor.angle_deg) if motor.position is None else motor.position
+
+    def untouching(self) -> Indices:
+        """Keys of the pairs of bodies that do not touch each other, as joints hold them, ascending."""
+        first, second = np.sort(self._named[~self.is_broken & ~self._touches], axis=1).T
+        return np.unique(pair_keys(first, second))
+
+    def links(self) -> tuple[Indices, Indices]:
+        """The pairs of moving bodies that joints hold together, (p,) each."""
+        pairs = self._bodies[~self.is_broken]
+        first, second = pairs[(pairs < self._n).all(axis=1)].T
+        return first, second
+
+    def beside(self, moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Bodies, (n,), that joints hold to bodies that move, (n,)."""
+        among, beside = np.append(moves, False), np.zeros(self._n + 1, dtype=bool)
+        first, second = self._bodies[~self.is_broken].T
+        beside[first[among[second]]] = beside[second[among[first]]] = True
+        return beside[: self._n]
+
+    def driven(self) -> NDArray[np.bool_]:
+        """Moving bodies that a motor keeps turning or going, (n,)."""
+        restless = np.zeros(self._n + 1, dtype=bool)
+        rows = (self._speed != 0.0) & ~self.is_broken[self._joint]
+        restless[self._row_bodies[rows]] = True
+        return restless[: self._n]
+
+    def begin(
+        self, bodies: MovingBodies, dt: float, is_active: NDArray[np.bool_], inverse_inertia: Array
+    ) -> JointStep | None:
+        """The joints of active bodies, (n,), before a step of dt [s]; None where there are none.
+
+        The velocities of the bodies are those with gravity; of kinematic bodies the means over the step.
+        """
+        system, values = self._system(bodies, is_active, inverse_inertia)
+        if not system.is_there.any():
+            return None
+        speeds = np.where(np.isnan(self._goal), self._speed, (self._goal - values) / self._response)
+        velocity = np.concatenate([bodies.velocity, bodies.angular_velocity], axis=1)
+        return JointStep(system, values, dt, velocity, speeds)
+
+    def _system(
+        self, bodies: MovingBodies, is_active: NDArray[np.bool_], inverse_inertia: Array
+    ) -> tuple[JointSystem, Array]:
+        """The rows where the bodies are now, and their values."""
+        frames = self._frames(bodies.position, bodies.orientation)
+        direction = self._directions(frames)
+        among = np.append(is_active, False)
+        is_there = ~self.is_broken[self._joint] & among[self._row_bodies].any(axis=1)
+        jacobian = self._jacobian(frames, direction)
+        inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
+        system = JointSystem.build(self._order, is_there, self._row_bodies, jacobian, inverse_mass, inverse_inertia)
+        return system, self._values(frames)
+
+    def impacts(self, step: JointStep) -> JointDemand:
+        """What joints ask while bodies bounce: what holds, holds."""
+        system, holds, limits = step.system, self._does == HOLDS, self._does == LIMITS
+        is_there = system.is_there & (holds | (limits & (step.values < TOUCHING)))
+        nothing = np.zeros(len(holds))
+        upper = np.full(len(holds), UNBOUNDED)
+        return JointDemand(system, is_there, nothing, nothing, np.where(holds, -UNBOUNDED, 0.0), upper)
+
+    def velocities(self, step: JointStep) -> JointDemand:
+        """What joints ask of a whole step, together with contacts."""
+        dt, does, values = step.dt, self._does, step.values
+        give = self._stiffness * 0.5 * dt + self._damping
+        pull = np.divide(self._stiffness * values, give, out=np.zeros_like(give), where=give > 0.0)
+        bias = np.select(
+            [does == HOLDS, does == LIMITS, does == DRIVES, does == PULLS],
+            [CLOSING_SHARE * values / dt, np.where(values > 0.0, 1.0, CLOSING_SHARE) * values / dt, -step.speeds, pull],
+        )
+        return self._demand(step.system, bias, self._softness(np.full(len(does), dt), dt), *self._bounds(dt))
+
+    def _softness(self, duration_s: Array, dt: float) -> Array:
+        """Velocity that a spring's impulse adds by giving way, (r,), of forces of such durations [s], (r,)."""
+        give = duration_s * (self._stiffness * 0.5 * dt + self._damping)
+        return np.divide(1.0, give, out=np.zeros_like(give), where=give > 0.0)
+
+    def _bounds(self, duration_s: Array | float) -> tuple[Array, Array]:
+        """Least and largest impulses of the rows in such a time [s]."""
+        drives = self._does == DRIVES
+        lower = np.where(self._does == LIMITS, 0.0, -UNBOUNDED)
+        most = self._strength * duration_s
+        return np.where(drives, -most, lower), np.where(drives, most, UNBOUNDED)
+
+    def _demand(self, system: JointSystem, bias: Array, softness: Array, lower: Array, upper: Array) -> JointDemand:
+        return JointDemand(system, system.is_there, bias, softness, lower, upper)
+
+    def hold(
+        self,
+        step: JointStep,
+        bodies: MovingBodies,
+        impulses: Array,
+        is_touched: NDArray[np.bool_],
+        *,
+        gravity: Array,
+        extra: Array,
+        is_held: NDArray[np.bool_],
+    ) -> JointHold:
+        """Change velocities so that the joints hold where the bodies get in the step.
+
+        Args:
+            step: the step.
+            bodies: with the velocities that contacts and joints found together.
+            impulses: of the joints among these, (r,).
+            is_touched: bodies that contacts or a fluid pushed, (n,); out: all of their components.
+            gravity: [m/s²], (3,).
+            extra: velocities (v, omega) of this step's change of poses alone, (n, 6).
+            is_held: bodies whose spin turns with that change, (n,).
+        """
+        system, dt, n = step.system, step.dt, self._n
+        component = self._order.component
+        pushed = np.zeros(len(self._order.components), dtype=bool)
+        touched = np.append(is_touched, False)
+        np.logical_or.at(pushed, component, (touched[self._row_bodies] & (system.movers >= 0)).any(axis=1))
+        whole = pushed[component]  # whether a row acts in one impulse for all of the step
+        for side in range(2):
+            rows = system.is_there & (system.movers[:, side] >= 0)
+            is_touched[system.movers[rows & whole, side]] = True
+            alone = system.movers[rows & ~whole, side]
+            bodies.velocity[alone], bodies.angular_velocity[alone] = step.velocity[alone, :3], step.velocity[alone, 3:]
+        total = np.where(whole & system.is_there, impulses, 0.0)
+        duration_s = np.where(whole, dt, 0.5 * dt)
+        lower, upper = self._bounds(duration_s)
+        softness = self._softness(duration_s, dt)
+
+        moving = self._members
+        fall = np.where(bodies.is_dynamic & ~is_touched, 0.5 * dt, 0.0)[:, None] * gravity
+        drift = (bodies.velocity - fall)[moving]
+        turn = rotation.exponential(dt * extra[moving, 3:])
+        base_position = bodies.position[moving] + dt * extra[moving, :3]
+        base_orientation = rotation.normalized(rotation.product(turn, bodies.orientation[moving]))
+        spin = bodies.angular_momentum()
+        is_led = ~bodies.is_dynamic[moving]
+        led = rotation.product(rotation.exponential(dt * bodies.angular_velocity[moving]), bodies.orientation[moving])
+        position, orientation = bodies.position.copy(), bodies.orientation.copy()
+        still = np.zeros((n + 1, 6))
+        change, converged = still.copy(), False
+        start = step.values
+        wanted = np.where((self._does == HOLDS) | (start < 0.0), (1.0 - CLOSING_SHARE) * start, 0.0)
+        wanted[np.abs(start) <= HELD] = 0.0
+        angle = self._angle
+        for _ in range(MOST_STEPS):
+            turning = spin[moving]
+            turning = np.where(is_held[moving, None], rotation.rotated(turn, turning), turning)
+            position[moving] = base_position + dt * (drift + change[moving, :3])
+            free = turned_freely(
+                base_orientation, bodies.principal_orientation[moving], bodies.principal_moments[moving], turning, dt
+            )
+            orientation[moving] = np.where(is_led[:, None], led, free)
+            frames = self._frames(position, orientation)
+            angle, values = frames.angle, self._values(frames)
+            bias = np.select(
+                [self._does == DRIVES, self._does == PULLS],
+                [
+                    (values - start) / dt - step.speeds,
+                    softness
+                    * (
+                        total
+                        + duration_s
+                        * (self._stiffness * 0.5 * (start + values) + self._damping * (values - start) / dt)
+                    ),
+                ],
+                (values - wanted) / dt,
+            )
+            found = solve_alone(self._demand(system, bias, softness, lower - total, upper - total), still)
+            total = total + found.impulses
+            change += found.velocity
+            spin += system.torques(found.impulses)
+            if not found.converged:
+                break
+            if dt * float(np.abs(system.velocities(found.velocity))[system.is_there].max()) <= HELD:
+                holds = system.is_there & (self._does == HOLDS)
+                converged = float(np.max(np.abs(values - wanted), initial=0.0, where=holds)) <= APART
+                break
+        bodies.velocity = bodies.velocity + change[:n, :3]
+        bodies.angular_velocity = bodies.angular_velocity + change[:n, 3:]
+        joints_there = np.zeros(len(self), dtype=bool)
+        joints_there[self._joint[system.is_there]] = True
+        self._angle = np.where(joints_there, angle, self._angle)
+        return JointHold(step, whole, total, converged)
+
+    def settle(
+        self, hold: JointHold, bodies: MovingBodies, is_active: NDArray[np.bool_], inverse_inertia: Array
+    ) -> None:
+        """Change velocities at the end of a step so that they agree with the joints, and break what is overloaded."""
+        step, dt = hold.step, hold.step.dt
+        before = step.system
+        system, values = self._system(bodies, is_active, inverse_inertia)
+        does, first, whole = self._does, hold.impulses, hold.is_whole
+        kick = np.where((does == PULLS) & ~whole & before.is_there, first, 0.0)
+        velocity = system.change(kick)
+        velocity[:-1, :3] += bodies.velocity
+        velocity[:-1, 3:] += bodies.angular_velocity
+        takes_part = system.is_there & (
+            (does == HOLDS) | ((does == LIMITS) & (first > 0.0)) | ((does == DRIVES) & ~whole)
+        )
+        bias = np.where(does == DRIVES, -step.speeds, 0.0)
+        lower, upper = self._bounds(0.5 * dt)
+        found = solve_alone(JointDemand(system, takes_part, bias, np.zeros(len(does)), lower, upper), velocity)
+        bodies.velocity, bodies.angular_velocity = found.velocity[:-1, :3].copy(), found.velocity[:-1, 3:].copy()
+
+        last = kick + found.impulses
+        self._break(before, first, system, last, dt)
+        holds = system.is_there & (does == HOLDS) & self._is_linear
+        if holds.any():
+            errors = np.where(holds, np.abs(values), 0.0)
+            self._gap_m = max(self._gap_m, float(errors.max()))
+        self._apart += not hold.converged
+
+    def _break(self, before: JointSystem, first: Array, after: JointSystem, last: Array, dt: float) -> None:
+        """Break joints whose mean force or torque over a step of dt [s] was too large."""
+        if not (np.isfinite(self._breaks_at).any() or np.isfinite(self._breaks_at_torque).any()):
+            return
+        for is_meant, part, limits in (
+            (self._is_linear, slice(0, 3), self._breaks_at),
+            (~self._is_linear, slice(3, 6), self._breaks_at_torque),
+        ):
+            sums = np.zeros((len(self), 3))
+            terms = before.jacobian[:, 0, part] * first[:, None] + after.jacobian[:, 0, part] * last[:, None]
+            np.add.at(sums, self._joint[is_meant], terms[is_meant])
+            self.is_broken |= np.sqrt(np.square(sums).sum(axis=1)) > limits * dt
+
+    def reduce_mobility(self, bodies: MovingBodies, inverse_mass: Array, inverse_inertia: Array) -> None:
+        """Take from inverse masses, (n,), and inertia, (n, 3, 3), what joints to the unmoved do not let move.
+
+        W - W Jᵀ (J W Jᵀ)⁺ J W of each body, without the parts that link its way and its turning, and the largest of the
+        masses of all directions.
+        """
+        system, _ = self._system(bodies, np.ones(len(bodies), dtype=bool), inverse_inertia)
+        alone = system.is_there & (self._does == HOLDS) & ((system.movers >= 0).sum(axis=1) == 1)
+        movers = system.movers.max(axis=1)
+        for body in np.unique(movers[alone]):
+            rows = np.flatnonzero(alone & (movers == body))
+            side = np.argmax(system.movers[rows], axis=1)
+            jacobian, response = system.jacobian[rows, side], system.response[rows, side]
+            mobility = np.zeros((6, 6))
+            mobility[:3, :3], mobility[3:, 3:] = inverse_mass[body] * np.eye(3), inverse_inertia[body]
+            mobility -= response.T @ np.linalg.pinv(jacobian @ response.T, rcond=REDUNDANT, hermitian=True) @ response
+            inverse_mass[body] = max(np.linalg.eigvalsh(mobility[:3, :3])[-1], 0.0)
+            inverse_inertia[body] = 0.5 * (mobility[3:, 3:] + mobility[3:, 3:].T)
+
+    def begin_frame(self) -> None:
+        """A frame starts: reset its counters."""
+        self._gap_m, self._apart = 0.0, 0
+
+    def diagnostics(self) -> Diagnostics:
+        """The largest gap of a joint in the frame [m], steps that did not find where all hold, and joints broken."""
+        return {
+            "joint_gap": self._gap_m,
+            "joints_apart": float(self._apart),
+            "joints_broken": float(np.count_nonzero(self.is_broken)),
+        }
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """What is broken, and the angles of hinges, whole turns included [rad]."""
+        return {"joints_broken": self.is_broken.copy(), "joint_angles": self._angle.copy()}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint. Raises ValueError when an array is missing or has another shape."""
+        for name in ("joints_broken", "joint_angles"):
+            if name not in arrays or arrays[name].shape != (len(self),):
+                raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape ({len(self)},)")
+        self.is_broken = np.array(arrays["joints_broken"], dtype=bool)
+        self._angle = np.array(arrays["joint_angles"], dtype=np.float64)
+
+    def _with_world(self, position: Array, orientation: Array) -> tuple[Array, Array]:
+        """Poses of the moving bodies and of the world, (n + 1, ...)."""
+        return np.concatenate([position, np.zeros((1, 3))]), np.concatenate([orientation, [[1.0, 0.0, 0.0, 0.0]]])
+
+    def _frames(self, position: Array, orientation: Array) -> _Frames:
+        """Where the joints are with bodies in these poses, (n, 3) and (n, 4)."""
+        position, orientation = self._with_world(position, orientation)
+        centres, turned = position[self._bodies], orientation[self._bodies]
+        own = rotation.rotated(turned[:, :, None], self._own)
+        axis, own_axis, tangents = own[:, 1, 1], own[:, 0, 1], own[:, 1, 2:]
+        cosine, sine = np.einsum("ji,jti->tj", own[:, 0, 2], tangents)
+        angle = np.arctan2(sine, cosine)
+        angle = angle + 2.0 * np.pi * np.round((self._angle - angle) / (2.0 * np.pi))
+        turn = rotation.product(turned[:, 0], rotation.conjugate(rotation.product(turned[:, 1], self._turn)))
+        return _Frames(
+            centres + own[:, :, 0],
+            centres,
+            axis,
+            own_axis,
+            tangents,
+            rotation.logarithm(turn),
+            angle,
+        )
+
+    def _values(self, frames: _Frames) -> Array:
+        """How far each row is from where it is 0, with its sign, (r,)."""
+        joint, about, part = self._joint, self._about, self._part
+        way = frames.ends[:, 0] - frames.ends[:, 1]
+        length = np.sqrt(np.square(way).sum(axis=1))
+        across = np.einsum("ji,jti->jt", way, frames.tangents)
+        aligned = np.einsum("ji,jti->jt", frames.own_axis, frames.tangents)
+        leaning = rotation.cross(frames.axis, frames.own_axis)
+        swing = np.arctan2(np.sqrt(np.square(leaning).sum(axis=1)), np.einsum("ji,ji->j", frames.axis, frames.own_axis))
+        along = np.einsum("ji,ji->j", way, frames.axis)
+        two = np.minimum(part, 1)
+        value = np.choose(
+            about,
+            [
+                way[joint, part],
+                across[joint, two],
+                along[joint],
+                length[joint],
+                frames.turn[joint, part],
+                aligned[joint, two],
+                frames.angle[joint],
+                swing[joint],
+            ],
+        )
+        result: Array = self._sign * (value - self._offset)
+        return result
+
+    def _directions(self, frames: _Frames) -> Array:
+        """Along what, or about what, each row acts on the first body, (r, 3)."""
+        joint, part = self._joint, self._part
+        way = frames.ends[:, 0] - frames.ends[:, 1]
+        leaning = rotation.cross(frames.axis, frames.own_axis)
+        unit = np.eye(3)[part]
+        two = np.minimum(part, 1)
+        aligned = rotation.cross(frames.own_axis[joint], frames.tangents[joint, two])
+        ways = [
+            unit,
+            frames.tangents[joint, two],
+            frames.axis[joint],
+            _unit(way)[joint],
+            unit,
+            aligned,
+            frames.axis[joint],
+            _unit(leaning)[joint],
+        ]
+        result: Array = self._sign[:, None] * np.choose(self._about[:, None], ways)
+        return result
+
+    def _jacobian(self, frames: _Frames, direction: Array) -> Array:
+        """Of the velocities (v, omega) of both bodies, (r, 2, 6)."""
+        jacobian = np.empty((len(direction), 2, 6))
+        # What slides along a body acts where the other's point is.
+        slides = (self._about == ACROSS) | (self._about == ALONG)
+        for side, sign in ((0, 1.0), (1, -1.0)):
+            end = frames.ends[self._joint, side]
+            end = np.where(slides[:, None], frames.ends[self._joint, 0], end)
+            arm = end - frames.centres[self._joint, side]
+            linear = self._is_linear[:, None]
+            jacobian[:, side, :3] = sign * np.where(linear, direction, 0.0)
+            jacobian[:, side, 3:] = sign * np.where(linear, rotation.cross(arm, direction), direction)
+        return jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class JointHold:
+    """What held the joints in a step."""
+
+    step: JointStep
+    is_whole: NDArray[np.bool_]  # rows whose impulses are those of the whole step, not of its first half, (r,)
+    impulses: Array  # at the start of the step, (r,)
+    converged: bool  # whether they hold at its end
+
+
+def _unit(vectors: Array) -> Array:
+    """Vectors, (k, 3), of unit length, along x where they have none."""
+    length = np.sqrt(np.square(vectors).sum(axis=1))[:, None]
+    return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), np.array([1.0, 0.0, 0.0]))
+
+
+def _across(axis: Array) -> Array:
+    """Two unit vectors across each axis, (k, 2, 3), right-handed with it (Duff et al. 2017)."""
+    x, y, z = axis.T
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    tangents = np.empty((len(axis), 2, 3))
+    tangents[:, 0, 0], tangents[:, 0, 1], tangents[:, 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    tangents[:, 1, 0], tangents[:, 1, 1], tangents[:, 1, 2] = b, sign + y * y * a, -y
+    return tangents

@@ -1,0 +1,60 @@
+"""Joints that cannot be are refused with the job, each at its line."""
+
+from checked_jobs import checked
+
+BODIES = """name = "a"
+frames = 2
+device = "cpu"
+
+[[rigid]]
+name = "post"
+shape = { type = "box", size = [0.1, 0.1, 0.4] }
+position = [0.0, 0.0, 0.2]
+
+[[rigid]]
+name = "arm"
+kind = "dynamic"
+density = 500.0
+shape = { type = "box", size = [0.3, 0.1, 0.1] }
+position = [0.15, 0.0, 0.3]
+"""
+
+NAIL = """
+[[joint]]
+name = "nail"
+kind = "fixed"
+between = ["arm", "post"]
+"""
+
+
+def test_bodies_that_a_joint_holds_may_overlap(tmp_path):
+    assert not checked(BODIES + NAIL, tmp_path / "job.toml").errors
+    (line,) = checked(BODIES, tmp_path / "job.toml").errors
+    assert "m deep in each other" in line
+    (line,) = checked(BODIES + NAIL + "contacts = true\n", tmp_path / "job.toml").errors
+    assert "m deep in each other" in line
+
+
+def test_every_wrong_joint_is_told_at_its_line(tmp_path):
+    text = BODIES + NAIL + NAIL.replace("post", "pole").replace("nail", "peg") + NAIL.replace('"nail"', '"bolt"')
+    errors = checked(text, tmp_path / "job.toml").errors
+    assert errors == [
+        'job.toml:25 joint[1].between: names no rigid body with "pole"; rigid bodies are post, arm',
+        'job.toml:30 joint[2].between: are held by joint "nail" already, and two that hold the same bodies fight; '
+        "remove one, or use ball joints alone",
+    ]
+
+
+def test_a_joint_far_from_its_body_is_told(tmp_path):
+    far = NAIL.replace('"fixed"', '"ball"') + "anchor = [20.0, 0.0, 0.3]\n"
+    lines = [line for line in checked(BODIES + far, tmp_path / "job.toml").warnings if "joint" in line]
+    assert [line.split("; ")[0] for line in lines] == [
+        'job.toml:17 joint[0]: is 19.7 m away from "arm", as if an arm without mass held it',
+        'job.toml:17 joint[0]: is 19.9 m away from "post", as if an arm without mass held it',
+    ]
+
+
+def test_joints_of_a_job_without_bodies_are_refused(tmp_path):
+    text = 'name = "a"\nframes = 2\n' + NAIL
+    errors = checked(text, tmp_path / "job.toml").errors
+    assert any('names no rigid body with "arm"; add [[rigid]]' in line for line in errors)
