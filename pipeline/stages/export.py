@@ -110,7 +110,7 @@ def frame_of(artifact: ArtifactPath) -> int:
 
 
 def meshes_of(job: Job) -> Iterator[tuple[RigidBodyParameters, str, ArtifactPath]]:
-    """Every part of every rigid body with its mesh at rest."""
+    """Every part of every rigid body with its mesh at rest, which bodies of a group share."""
     for body in job.rigid:
         for part in parts_of(body.shape.type):
-            yield body, part, JobLayout.body_mesh(body.name, part)
+            yield body, part, JobLayout.body_mesh(body.model, part)

@@ -23,15 +23,16 @@ if TYPE_CHECKING:
 
 def build_solids(placements: Iterable[tuple[KeyPath, Placement]], findings: Findings) -> Solids:
     """Every shape that can be built, by its path; notes what is wrong with the others."""
-    from sim.shapes.placement import build_solid
+    from sim.shapes.placement import SharedShapes, build_solid
     from sim.shapes.solid import ShapeError
 
     solids = {}
+    shapes = SharedShapes()
     for path, placement in placements:
         if not mesh_exists(placement.shape, path, findings):
             continue
         try:
-            solids[path] = build_solid(placement)
+            solids[path] = build_solid(placement, shapes)
         except ShapeError as error:
             findings.error((*path, "shape"), str(error))
             continue
