@@ -60,7 +60,9 @@ class InvalidJobError(JobFileError):
     def standing_job(self) -> Job | None:
         """The part of the job that stands, its files absolute; None if nothing does."""
         job = self.standing.job
-        for change in [] if job is None else _absolute_files(job, self.path):
+        if job is None:
+            return None
+        for change in _absolute_files(job, self.path):
             job = with_written(job, change.path, change.value)
         return job
 

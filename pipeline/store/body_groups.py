@@ -7,7 +7,7 @@ second. A thousand bodies are four datasets, not four thousand.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
@@ -66,7 +66,7 @@ class OneOfGroup:
         return Snapshot(str(self.attrs["kind"]), arrays, own, self._group)
 
 
-BodyGroup = h5py.Group | OneOfGroup
+BodyGroup: TypeAlias = h5py.Group | OneOfGroup
 
 
 class BodyGroups(Mapping[str, Any]):
@@ -90,9 +90,9 @@ class BodyGroups(Mapping[str, Any]):
         return len(self._names)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._rows or (name in self._groups and COUNT not in self._groups[name].attrs)
+        return name in self._rows or name in self._names
 
-    def __getitem__(self, name: str) -> BodyGroup:
+    def __getitem__(self, name: str) -> Any:
         if name not in self._rows:
             return self._groups[name]
         group, row = self._rows[name]

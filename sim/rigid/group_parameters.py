@@ -20,9 +20,7 @@ Room = Annotated[
 class JitterParameters(Parameters):
     """How much the bodies of a group are out of line: each by a random part of it, to either side."""
 
-    position: NonNegativeVector3 = Field(
-        default=(0.0, 0.0, 0.0), description="Most along the world's x, y, z [m]."
-    )
+    position: NonNegativeVector3 = Field(default=(0.0, 0.0, 0.0), description="Most along the world's x, y, z [m].")
     rotation_deg: NonNegativeVector3 = Field(
         default=(0.0, 0.0, 0.0), description="Most about the body's own x, then y, then z [degrees]."
     )

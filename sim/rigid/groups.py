@@ -130,9 +130,7 @@ def _any_turns(chances: Array) -> Array:
     """
     first, second = np.sqrt(1.0 - chances[:, 0]), np.sqrt(chances[:, 0])
     one, two = 2.0 * np.pi * chances[:, 1], 2.0 * np.pi * chances[:, 2]
-    return np.stack(
-        [first * np.sin(one), first * np.cos(one), second * np.sin(two), second * np.cos(two)], axis=1
-    )
+    return np.stack([first * np.sin(one), first * np.cos(one), second * np.sin(two), second * np.cos(two)], axis=1)
 
 
 def _uniform(table: RigidBodyParameters, what: str, shape: tuple[int, ...]) -> Array:
