@@ -63,7 +63,7 @@ class BodiesStage(Stage):
                 subject=body.name,
             )
             for body in job.rigid
-            if body.model == body.name
+            if body.is_own_model
         ]
 
     def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002

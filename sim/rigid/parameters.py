@@ -123,6 +123,11 @@ class RigidBodyParameters(WeightedPlacement):
         return self._model or self.name
 
     @property
+    def is_own_model(self) -> bool:
+        """Whether its mesh is not that of another body."""
+        return self.model == self.name
+
+    @property
     def body_count(self) -> int:
         """How many bodies the table makes."""
         if self.count is None:

@@ -10,7 +10,7 @@ from pipeline.job.checks.optical_depth import check_optical_depths
 from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_set
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.kinds.base import Kind
-from pipeline.kinds.checks.memory_budget import MemoryBudget, memory_budget
+from pipeline.kinds.checks.memory_budget import MemoryBudget, free_bytes, memory_budget
 from pipeline.kinds.checks.shapes import build_solids, in_scale
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.table import KINDS, bodies, described_material, is_meant, placements
@@ -44,7 +44,9 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
     _check_pictures(job, findings)
     check_set(job, findings)
     if check_magnitudes(job, findings):
-        solids = in_scale(build_solids(placements(job), findings), simulated_regions(job), findings)
+        solids = in_scale(
+            build_solids(placements(job), findings, room_bytes=free_bytes()), simulated_regions(job), findings
+        )
         budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
         check_camera(job, solids, findings)
         for kind in KINDS.values():

@@ -89,7 +89,7 @@ class JobScene:
         built: dict[tuple[str, str], Mesh] = {}
         failed: list[str] = []
         for body in self._job.rigid:
-            if body.model != body.name:
+            if not body.is_own_model:
                 continue
             files = [self._layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
             try:
