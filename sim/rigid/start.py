@@ -68,8 +68,8 @@ def _overlaps(solver: RigidSolver) -> list[StartProblem]:
         is_convex = all(isinstance(geometry.solid.shape, CONVEX) for geometry in pair)
         names = solver.all_names[first], solver.all_names[second]
         sentence = (
-            f'rigid bodies "{names[0]}" and "{names[1]}" start {way if is_convex else depth:.3g} m deep in each other, around '
-            f'{_triple(place)} m; move "{solver.all_names[mover]}" by {_rounded_up(way * direction)} m'
+            f'rigid bodies "{names[0]}" and "{names[1]}" start {way if is_convex else depth:.3g} m deep in each other, '
+            f'around {_triple(place)} m; move "{solver.all_names[mover]}" by {_rounded_up(way * direction)} m'
         )
         problems.append(StartProblem(solver.all_names[mover], sentence))
     return problems
