@@ -71,8 +71,10 @@ def _nested_tables(path: str, property_: schema.Node) -> Iterator[tuple[str, str
 def _table_of(path: str, property_: schema.Node) -> tuple[schema.Node | None, str]:
     """The table that a property holds, one or many, and how its header is written."""
     definitions = schema.job_schema()["$defs"]
+    optional = next((option for option in property_.get("anyOf", ()) if "$ref" in option), None)
     for node, heading in (
         (property_, f"[{path}]"),
+        (optional, f"[{path}]"),
         (property_.get("items"), f"[[{path}]]"),
         (property_.get("additionalProperties"), f"[{path}.NAME]"),
     ):

@@ -22,7 +22,7 @@ Count = Annotated[int, Field(ge=1, le=MOST_OF_A_GROUP)]
 class RigidBodyParameters(WeightedPlacement):
     """A rigid body: fixed, moved along a path, or moved by forces and contacts; or a group of such bodies.
 
-    A table with `count` is a group: `sim.rigid.groups.with_groups` makes its bodies, which share all other keys.
+    A table with `count` is a group: its bodies share all other keys.
     """
 
     name: BodyName = Field(description="Name of the body, unique in the job.")
@@ -59,8 +59,8 @@ class RigidBodyParameters(WeightedPlacement):
     count: Count | tuple[Count, Count, Count] | None = Field(
         default=None,
         exclude=True,
-        description="Makes a group of so many bodies, named NAME_1, NAME_2, ...: one number, or those along x, y and z "
-        "of a lattice, of which the first body is at the position. The rotation turns the lattice, too.",
+        description="Makes a group of so many bodies [-], named NAME_1, NAME_2, ...: one number, or those along x, y "
+        "and z of a lattice, of which the first body is at the position. The rotation turns the lattice, too.",
     )
     spacing: Positive | Vector3 | None = Field(
         default=None,
