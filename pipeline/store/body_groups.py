@@ -81,7 +81,7 @@ class BodyGroups(Mapping[str, Any]):
                 self._rows |= {f"{name}_{row + 1}": (name, row) for row in range(int(count))}
         of_groups = {group for group, _ in self._rows.values()}
         self._names = [*(name for name in groups if name not in of_groups), *self._rows]
-        self._read: dict[str, dict[str, NDArray[Any]]] = {}
+        self._read: dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]] = {}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -97,8 +97,9 @@ class BodyGroups(Mapping[str, Any]):
             return self._groups[name]
         group, row = self._rows[name]
         if group not in self._read:
-            self._read[group] = {key: read_array(item) for key, item in self._groups[group].items()}
-        return OneOfGroup(group, dict(self._groups[group].attrs), self._read[group], row)
+            found = self._groups[group]
+            self._read[group] = dict(found.attrs), {key: read_array(item) for key, item in found.items()}
+        return OneOfGroup(group, *self._read[group], row)
 
     def kinds(self) -> dict[str, str]:
         """The kind of each body, by its name; no array is read."""
