@@ -180,7 +180,11 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
     place = coordinates["Object" if is_ground else "Generated"]
     scale = 7.0 / context.domain_size if is_ground else 7.0
     if not is_ground:
-        place = builder.vector_math("ADD", place, tuple(10.0 * each for each in context.own_numbers(3)))
+        numbers = builder.own_numbers(context, 3)
+        way = (
+            builder.scaled(builder.combined(*numbers), 10.0) if context.is_shared else [10.0 * each for each in numbers]
+        )
+        place = builder.vector_math("ADD", place, way)
     noise = builder.noise(place, Scale=scale, Detail=6.0, Roughness=0.62)
     depth = 0.006 * context.domain_size if context.edges is None else 0.03 * math.hypot(*context.edges)
     dark = (0.55 * red, 0.55 * green, 0.55 * blue)
@@ -188,7 +192,9 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
     bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=depth, Height=noise)
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
-        Base_Color=builder.ramp(noise, (0.3, dark), (0.72, light)),
+        Base_Color=builder.own_tint(
+            context, builder.ramp(noise, (0.3, dark), (0.72, light)), brightness=0.35, warmth=0.1
+        ),
         Roughness=or_default(context.roughness, 0.8),
         Specular_IOR_Level=0.3,
         Normal=bump.outputs["Normal"],
@@ -278,12 +284,18 @@ def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
 @draws("metal")
 def _metal(builder: NodeBuilder, context: LookContext) -> None:
     """Steel, of another melt and polish for each body."""
-    polish = 2.0 ** (0.35 * context.own_numbers(3)[2])
-    color = context.own_shade((0.62, 0.61, 0.60), brightness=0.1, warmth=0.05)
-    _even(builder, context, color=color, roughness=0.28 * polish, Metallic=1.0)
+    shades = {"brightness": 0.1, "warmth": 0.05}
+    color = builder.own_tint(context, context.own_shade((0.62, 0.61, 0.60), **shades), **shades)
+    roughness: Any
+    if context.is_shared:
+        polish = builder.math("POWER", 2.0, builder.math("MULTIPLY", builder.own_numbers(context, 3)[2], 0.35))
+        roughness = builder.math("MULTIPLY", polish, 0.28)
+    else:
+        roughness = 0.28 * 2.0 ** (0.35 * context.own_numbers(3)[2])
+    _even(builder, context, color=color, roughness=roughness, Metallic=1.0)
 
 
-def _even(builder: NodeBuilder, context: LookContext, *, color: Color, roughness: float, **inputs: float) -> None:
+def _even(builder: NodeBuilder, context: LookContext, *, color: Any, roughness: Any, **inputs: float) -> None:
     """An opaque surface of one colour; other inputs of the shader by name."""
     builder.surface(
         builder.node(

@@ -18,6 +18,7 @@ import os
 import queue
 import sys
 import threading
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,7 +56,7 @@ from blender_scripts.errors import RenderFailedError, RenderInputError
 from blender_scripts.look_table import LOOK_TABLE
 from blender_scripts.optics import REFRACTIVE_INDEX
 from blender_scripts.ply import SurfaceMesh, write_mesh
-from blender_scripts.shading import LookContext, SmokeBox
+from blender_scripts.shading import LookContext, SmokeBox, tell_apart
 from blender_scripts.smoke_looks import glow_of
 
 SPEC_VERSION = 4
@@ -112,6 +113,8 @@ class SceneRenderer:
         self._has_wet = not is_plain and any(_wets(description) for description in spec["objects"])
         self.pictures_by_uv: list[str] = []
         self._floor_z = spec["domain_min"][2]
+        self._copies = Counter(filter(None, map(self._shared_by, spec["objects"])))
+        self._models: dict[str, _Model] = {}
         drawn = [(description, self._add_object(description, spec)) for description in spec["objects"]]
         # Blender may have chosen another name than the job's.
         casters = {made.name for description, made in drawn if description["material"]["caustics"]}
@@ -287,7 +290,38 @@ class SceneRenderer:
         """The pattern of samples of a frame that a moving camera sees."""
         return int((self._seed + frame) % 2**31)
 
+    def _shared_by(self, description: dict[str, Any]) -> str | None:
+        """What objects have in common that share a mesh and its material; None for those whose mesh is their own."""
+        if description["type"] not in ("mesh", "moving_mesh") or self._is_covered(description):
+            return None
+        common = ("file", "material", "shade_smooth_angle_deg")
+        return json.dumps([description[key] for key in common], sort_keys=True)
+
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> Any:
+        """Add an object; those of a group share mesh and material, and tell their own numbers."""
+        shared_by = self._shared_by(description)
+        is_shared = shared_by is not None and self._copies[shared_by] > 1
+        if not is_shared:
+            return self._add_new_object(description, spec, is_shared=False)
+        assert shared_by is not None
+        model = self._models.get(shared_by)
+        if model is None:
+            made = self._add_new_object(description, spec, is_shared=True)
+            self._models[shared_by] = _Model(description["name"], made.data, self._touchable_of(description))
+        else:
+            made = geometry.new_object(description["name"], model.mesh)
+            self._place_body(description, made)
+            if model.touchable is not None:
+                self._touched.append((description, model.touchable))
+            if model.name in self.pictures_by_uv:
+                self.pictures_by_uv.append(description["name"])
+        tell_apart(made, description["name"])
+        return made
+
+    def _touchable_of(self, description: dict[str, Any]) -> wetting.Touchable | None:
+        return next((body for each, body in self._touched if each is description), None)
+
+    def _add_new_object(self, description: dict[str, Any], spec: dict[str, Any], *, is_shared: bool) -> Any:
         name, kind = description["name"], description["type"]
         look = description["material"]["look"]
         at_rest = geometry.read_ply(self._folder / description["file"]) if kind in ("mesh", "moving_mesh") else None
@@ -305,6 +339,7 @@ class SceneRenderer:
             name=name,
             wets=_wets(description),
             is_covered=self._is_covered(description),
+            is_shared=is_shared,
         )
         if description["material"]["blend"] is None:
             material = looks.new_material(name, look, context)
@@ -338,17 +373,29 @@ class SceneRenderer:
 
     def _take_body(self, description: dict[str, Any], blender_object: Any, at_rest: SurfaceMesh) -> None:
         """Put a body where it stands, or note that it moves, and what fluids are to know of it."""
+        self._place_body(description, blender_object)
+        geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
+        if self._is_touched(description):
+            self._touched.append((description, wetting.Touchable.of(at_rest, is_closed=True)))
+        if self._is_covered(description):
+            self._vessels.append(_Vessel(description, blender_object, at_rest, self._touched[-1][1]))
+
+    def _place_body(self, description: dict[str, Any], blender_object: Any) -> None:
         blender_object.rotation_mode = "QUATERNION"
         if description["type"] == "mesh":
             blender_object.location = description["position"]
             blender_object.rotation_quaternion = description["orientation"]
         else:
             self._bodies.append((description, blender_object))
-        geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
-        if self._is_touched(description):
-            self._touched.append((description, wetting.Touchable.of(at_rest, is_closed=True)))
-        if self._is_covered(description):
-            self._vessels.append(_Vessel(description, blender_object, at_rest, self._touched[-1][1]))
+
+
+@dataclass(frozen=True)
+class _Model:
+    """What the objects of a group share."""
+
+    name: str  # of the first of them
+    mesh: Any  # Blender's, with the material
+    touchable: wetting.Touchable | None
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ class LookContext:
         name: of the body, whose texture and shade are its own; empty for the ground.
         wets: whether the mesh tells where it touches solids, as a fluid's does (`wetting`).
         is_covered: whether the mesh tells where a liquid covers it, as that of a vessel does.
+        is_shared: whether bodies of several names have the material; each tells its own numbers (`tell_apart`).
 
     The others are as in `render.parameters.MaterialParameters`.
     """
@@ -61,6 +62,7 @@ class LookContext:
     name: str = ""
     wets: bool = False
     is_covered: bool = False
+    is_shared: bool = False
     color: Color | None = None
     roughness: float | None = None
     caustics: bool | None = None
@@ -80,14 +82,15 @@ class LookContext:
 
     def own_numbers(self, count: int) -> list[float]:
         """Numbers from -1 to 1 by the name of the body, its parts included: the same in every process and frame."""
-        if not self.name:
-            return [0.0] * count
-        body = self.name.partition(".")[0].encode()
-        words = struct.unpack(f">{count}H", hashlib.blake2b(body, digest_size=2 * count).digest())
-        return [word / 32767.5 - 1.0 for word in words]
+        return own_numbers(self.name, count)
 
     def own_shade(self, color: Color, *, brightness: float, warmth: float) -> Color:
-        """The body's own shade of a colour: so many stops brighter or darker at most, and warmer or cooler."""
+        """The body's own shade of a colour: so many stops brighter or darker at most, and warmer or cooler.
+
+        Of a shared material the colour itself, which `NodeBuilder.own_tint` gives the shade of each body.
+        """
+        if self.is_shared:
+            return color
         light, warm = self.own_numbers(2)
         stops = brightness * light + warmth * warm, brightness * light, brightness * light - warmth * warm
         red, green, blue = (min(1.0, channel * 2.0**each) for channel, each in zip(color, stops, strict=True))
@@ -101,6 +104,26 @@ class LookContext:
             if own[name] is not None:
                 own[name] = tuple(own[name])
         return cls(**scene, **own)
+
+
+OWN_NUMBERS = "own_numbers_{}"
+"""Property of an object that tells so many numbers of its own."""
+MOST_OWN_NUMBERS = 3
+
+
+def own_numbers(name: str, count: int) -> list[float]:
+    """Numbers from -1 to 1 by the name of a body, its parts included: the same in every process and frame."""
+    if not name:
+        return [0.0] * count
+    body = name.partition(".")[0].encode()
+    words = struct.unpack(f">{count}H", hashlib.blake2b(body, digest_size=2 * count).digest())
+    return [word / 32767.5 - 1.0 for word in words]
+
+
+def tell_apart(blender_object: Any, name: str) -> None:
+    """Give an object with a shared material the numbers by which the look of its body, of this name, is its own."""
+    for count in range(1, MOST_OWN_NUMBERS + 1):
+        blender_object[OWN_NUMBERS.format(count)] = [*own_numbers(name, count), 0.0, 0.0][:MOST_OWN_NUMBERS]
 
 
 class NodeBuilder:
@@ -168,10 +191,12 @@ class NodeBuilder:
         self._set(node.inputs[0], factor)
         return node.outputs["Color"]
 
-    def mix_colors(self, factor: Any, first: Any, second: Any) -> Any:
+    def mix_colors(self, factor: Any, first: Any, second: Any, **settings: Any) -> Any:
         """The output socket of the first colour where the factor is 0, the second where it is 1."""
         node = self.tree.nodes.new("ShaderNodeMix")
         node.data_type = "RGBA"
+        for key, value in settings.items():
+            setattr(node, key, value)
         # The node has a socket for every type of data, with equal names.
         colors = [socket for socket in node.inputs if socket.type == "RGBA"]
         for value, socket in zip((factor, first, second), (node.inputs[0], *colors), strict=True):
@@ -184,6 +209,25 @@ class NodeBuilder:
         for value, socket in zip((factor, first.outputs[0], second.outputs[0]), mix.inputs, strict=True):
             self._set(socket, value)
         return mix
+
+    def own_numbers(self, context: LookContext, count: int) -> list[Any]:
+        """The numbers of a body, as `LookContext.own_numbers`; output sockets where several share the material."""
+        if not context.is_shared:
+            return list(context.own_numbers(count))
+        node = self.tree.nodes.new("ShaderNodeAttribute")
+        node.attribute_type, node.attribute_name = "OBJECT", OWN_NUMBERS.format(count)
+        return self.split(node.outputs["Vector"])[:count]
+
+    def own_tint(self, context: LookContext, color: Any, *, brightness: float, warmth: float) -> Any:
+        """A colour in each body's own shade where several share the material, as `LookContext.own_shade` has it."""
+        if not context.is_shared:
+            return color
+        light, warm = self.own_numbers(context, 2)
+        middle = self.math("MULTIPLY", light, brightness)
+        aside = self.math("MULTIPLY", warm, warmth)
+        stops = self.math("ADD", middle, aside), middle, self.math("SUBTRACT", middle, aside)
+        factors = self.combined(*(self.math("POWER", 2.0, each) for each in stops))
+        return self.mix_colors(1.0, color, factors, blend_type="MULTIPLY", clamp_result=True)
 
     def surface(self, shader: Any) -> None:
         """Use a node's first output as the surface."""

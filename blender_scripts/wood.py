@@ -33,7 +33,7 @@ def _wood(builder: NodeBuilder, context: LookContext) -> None:
     # Trunks are not round: a slow noise, drawn out along the grain, bends the rings.
     bend = _noise(builder, position, (1.1, 1.1, 0.32), detail=2.0)
     across = builder.vector_math("MULTIPLY", position, (1.0, 1.0, 0.0))
-    distance = builder.vector_math("LENGTH", builder.vector_math("ADD", across, (*_pith(context), 0.0)))
+    distance = builder.vector_math("LENGTH", builder.vector_math("ADD", across, _pith(builder, context)))
     radius = builder.math("ADD", distance, builder.math("MULTIPLY", bend, 0.45))
     phase = builder.math("FRACT", builder.math("MULTIPLY", radius, _RINGS))
     # Early wood darkens towards late wood slowly; the next year begins sharply.
@@ -46,21 +46,25 @@ def _wood(builder: NodeBuilder, context: LookContext) -> None:
     shade = builder.math("MULTIPLY", builder.math("SUBTRACT", shade, pore), builder.math("MULTIPLY", tone, joint))
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
-        Base_Color=builder.scaled(color, shade),
+        Base_Color=builder.own_tint(context, builder.scaled(color, shade), brightness=_BRIGHTNESS, warmth=_WARMTH),
         Roughness=or_default(context.roughness, 0.42),
         Specular_IOR_Level=0.35,
     )
     builder.surface(shader)
 
 
-def _pith(context: LookContext) -> tuple[float, float]:
-    """Where the rings have their middle [trunks]."""
+def _pith(builder: NodeBuilder, context: LookContext) -> Any:
+    """Where the rings have their middle [trunks]: a vector, or the output socket of one."""
     if context.surface == "ground":
-        return _PITH
-    turn, farther = context.own_numbers(2)
+        return (*_PITH, 0.0)
+    turn, farther = builder.own_numbers(context, 2)
     mean, most = _PITH_DISTANCE
-    distance = mean + most * farther
-    return distance * math.cos(math.pi * turn), distance * math.sin(math.pi * turn)
+    if not context.is_shared:
+        distance = mean + most * farther
+        return distance * math.cos(math.pi * turn), distance * math.sin(math.pi * turn), 0.0
+    angle = builder.math("MULTIPLY", turn, math.pi)
+    way = builder.combined(builder.math("COSINE", angle), builder.math("SINE", angle))
+    return builder.scaled(way, builder.math("MULTIPLY_ADD", farther, most, mean))
 
 
 def _trunk(builder: NodeBuilder, context: LookContext) -> tuple[Any, Any, Any]:
@@ -76,9 +80,13 @@ def _trunk(builder: NodeBuilder, context: LookContext) -> tuple[Any, Any, Any]:
         width = edges[order[1]]
     parts = builder.split(builder.scaled(place, 1.0 / max(width, 1e-9)))
     # No two bodies come from the same place of it.
-    (along,) = context.own_numbers(1)
+    (along,) = builder.own_numbers(context, 1)
     place = builder.combined(*(parts[axis] for axis in order))
-    return builder.vector_math("ADD", place, (0.0, 0.0, _TRUNK_LENGTH * along)), 1.0, 1.0
+    if context.is_shared:
+        farther = builder.combined(0.0, 0.0, builder.math("MULTIPLY", along, _TRUNK_LENGTH))
+    else:
+        farther = (0.0, 0.0, _TRUNK_LENGTH * along)
+    return builder.vector_math("ADD", place, farther), 1.0, 1.0
 
 
 def _boards(builder: NodeBuilder, context: LookContext) -> tuple[Any, Any, Any]:

@@ -20,6 +20,7 @@ from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import LoadedJob, make_job
 from pipeline.kinds.table import world_of
+from pipeline.model.problems import unknown_name
 from pipeline.queue.submitting import QueueOptions
 from pipeline.queue.submitting import submit as submit_to_queue
 from pipeline.run.checked_job import read_own_job
@@ -114,12 +115,16 @@ class Scene:
 
         - fluid: `position` [m], `velocity` [m/s], (n, 3); `particle_id` (n,); in the solver's order, which changes
         - cloth: `position` [m], `velocity` [m/s], (n, 3), in the order of the snapshot
-        - rigid: `position`, `orientation`, `velocity`, `angular_velocity`, as in the snapshot
+        - rigid: `position`, `orientation`, `velocity`, `angular_velocity`, as in the snapshot; of a group, by its name,
+          those of all its bodies, (n, 3) and (n, 4)
         - smoke: `density` [-], `excess_temperature` [K], (nx, ny, nz)
 
         Raises:
             ValueError: there is no such body, or its solver lets nobody look.
         """
+        if names := self._names_in(body):
+            there = self.bodies()
+            return {key: np.stack([there[name].arrays[key] for name in names]) for key in there[names[0]].arrays}
         solver = self._solver_of(body)
         if solver is None:
             return self.bodies()[body].arrays
@@ -139,7 +144,7 @@ class Scene:
         centre of mass. No checkpoint and no submitted job knows of it.
 
         Args:
-            body: its name.
+            body: its name, or that of a group, on each body of which it acts.
             force: force per mass [m/s²], (3,), or a function of the body's arrays (`view`) and the time at which the
                 frame starts [s] that returns it, (3,) or (n, 3) in the order of the arrays.
 
@@ -147,6 +152,10 @@ class Scene:
             ValueError: there is no such body, nothing can push it (it is static, kinematic, or smoke), or a force that
                 is no function has another shape.
         """
+        if names := self._names_in(body):
+            for name in names:
+                self.add_force(name, force)
+            return
         solver = self._solver_of(body)
         if isinstance(solver, TakesPushes):
             solver.push(body, np.zeros(3))  # refuses what keyframes lead
@@ -171,8 +180,12 @@ class Scene:
     def _solver_of(self, body: str) -> Solver | None:
         """The solver of a body; None for one that never moves. Raises ValueError: there is no such body."""
         if body not in self._solvers:
-            raise ValueError(f'no body is named "{body}"; bodies are {", ".join(self._solvers)}')
+            raise ValueError(unknown_name(body, self._solvers, "body", plural="bodies"))
         return self._solvers[body]
+
+    def _names_in(self, group: str) -> list[str]:
+        """Names of the bodies of a group; none if nothing is called so."""
+        return [name for name, of in self.job.groups.items() if of == group]
 
     @cached_property
     def _solvers(self) -> dict[str, Solver | None]:

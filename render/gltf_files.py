@@ -64,6 +64,7 @@ def write_glb(
         TooLargeError: it would be larger.
     """
     scene = _Scene(times, limit_bytes)
+    smooth: dict[tuple[int, float], SurfaceMesh] = {}  # several bodies may have one mesh
     for drawn in spec.objects:
         look = preview_of(drawn.material)
         if isinstance(drawn, MeshObject | MovingMeshObject):
@@ -72,7 +73,10 @@ def write_glb(
                 places: Sequence[Placement] = [Placement(drawn.position, drawn.orientation)]
             else:
                 places = placements[drawn.name]
-            scene.add_body(drawn.name, look, _smooth(meshes[drawn.name], angle), places)
+            mesh = meshes[drawn.name]
+            if (id(mesh), angle) not in smooth:
+                smooth[id(mesh), angle] = _smooth(mesh, angle)
+            scene.add_body(drawn.name, look, smooth[id(mesh), angle], places)
         elif isinstance(drawn, MeshSequenceObject):
             scene.add_sequence(drawn.name, look, sequences[drawn.name])
     scene.add_camera(spec.render.resolution, views)
@@ -139,13 +143,20 @@ class _Scene:
         self._samplers: list[dict[str, Any]] = []
         self._frame_times = np.asarray(times, np.float32)
         self._times = self._add(self._frame_times, bounds=True) if len(times) > 1 else None
+        # of bodies, by mesh and look: the number, and the mesh itself, which keeps its identity
+        self._of_bodies: dict[tuple[Any, ...], tuple[int, SurfaceMesh]] = {}
         self._shown: dict[int, tuple[int, int]] = {}  # times and scales that show a frame's meshes
 
     def add_body(self, name: str, look: PreviewLook, mesh: SurfaceMesh, places: Sequence[Placement]) -> None:
-        """A mesh, at one place or at one a frame."""
+        """A mesh, at one place or at one a frame; bodies of one mesh and look share it in the file."""
         turns = _turns([place.orientation for place in places])
         where = _y_up([place.position for place in places])
-        node = self._add_node(name, mesh=self._add_mesh(name, mesh, self._add_material(name, look)))
+        key = id(mesh), look.color, tuple(sorted(look.numbers.items()))
+        shared = self._of_bodies.get(key)
+        if shared is None:
+            shared = self._add_mesh(name, mesh, self._add_material(name, look)), mesh
+            self._of_bodies[key] = shared
+        node = self._add_node(name, mesh=shared[0])
         self._place(node, where, turns)
 
     def add_sequence(self, name: str, look: PreviewLook, meshes: Iterable[SurfaceMesh]) -> None:

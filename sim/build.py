@@ -35,7 +35,7 @@ from sim.rigid.solver import SOLVER_NAME as RIGID_NAME
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import check_start
 from sim.rigid.states import StaticBody
-from sim.shapes.placement import build_solid
+from sim.shapes.placement import SharedShapes, build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.smoke.solver import SmokeSolver
 
@@ -60,7 +60,8 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         ValueError: a body cannot start as described.
     """
     _refuse_names(scene)
-    static = [StaticBody(parameters) for parameters in scene.rigid if parameters.kind == "static"]
+    shapes = SharedShapes()
+    static = [StaticBody(parameters, shapes) for parameters in scene.rigid if parameters.kind == "static"]
     rigid = _build_rigid(scene)
     cloths = []
     if scene.cloth:  # one solver for all, as they collide with each other
@@ -107,7 +108,8 @@ def _build_fluids(
     discretization = Discretization(spacing, support)
     volume = discretization.particle_volume
     movers = [body for body in scene.rigid if body.kind != "static"]
-    solids = [*(body.solid for body in static), *(build_solid(body) for body in movers)]
+    shapes = SharedShapes()
+    solids = [*(body.solid for body in static), *(build_solid(body, shapes) for body in movers)]
     fluids = with_emitters_on(scene.fluid, scene.rigid)
     followed = {body.name: body for body in movers}
     _check_openings(fluids, scene, solids, followed, spacing, volume)

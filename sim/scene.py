@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
 from sim.fluid.parameters import FluidParameters, dye_conflict
+from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
@@ -20,7 +21,9 @@ class SceneParameters(Parameters):
 
     gravity: Vector3 = Field(default=(0.0, 0.0, -9.81), description="Gravity [m/s²].")
     domain: DomainParameters = Field(default=DomainParameters(), description="The box that the fluid lives in.")
-    rigid: tuple[RigidBodyParameters, ...] = Field(default=(), description="Rigid bodies.")
+    rigid: Annotated[tuple[RigidBodyParameters, ...], AfterValidator(with_groups)] = Field(
+        default=(), description="Rigid bodies; a table with count makes many."
+    )
     joint: tuple[JointParameters, ...] = Field(default=(), description="Joints between rigid bodies, or to the world.")
     fluid: tuple[FluidParameters, ...] = Field(
         default=(), description="Particle fluids; several share one tank, and the keys that say how it is computed."

@@ -121,7 +121,7 @@ class JobLayout:
 
     @staticmethod
     def body_mesh(body: str, part: str = "body") -> ArtifactPath:
-        """PLY mesh of a rigid body, or of a part of it, in its rest pose."""
+        """PLY mesh of a rigid body, or of a part of it, in its rest pose; a group shares that of its model."""
         return ArtifactPath(f"meshes/{body}.ply" if part == "body" else f"meshes/{body}.{part}.ply")
 
     @staticmethod

@@ -147,6 +147,8 @@ class CountedEvent:
     running_total: bool = False  # counted since the start; else in every frame by itself
     # what it means for the film and what helps, by kind of body
     means: Mapping[str, str] = field(default_factory=dict, hash=False)
+    # the number that tells how bad it was, by kind of body: {worst} in what it means
+    measured_by: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def text(self, count: int) -> str:
         """Count in words: `3 solves hit their iteration limit`."""
@@ -162,9 +164,11 @@ WARNINGS = (
             "fluid": "it is denser there than density_tolerance asks, which shows as lost volume if it goes on; give "
             "more max_iterations or a smaller cfl",
             "smoke": "some air appears or vanishes, which hardly shows; give more projection_max_iterations",
-            "rigid": "forces in a pile were not quite in balance, so that it may tremble, or sink in by the deepest "
-            "penetration that is told; start bodies nearer to where they rest, or give densities less far apart",
+            "rigid": "forces in a pile were not quite in balance there, so that it may tremble; bodies sank into each "
+            "other by up to {worst}, which shows from about a hundredth of their size on. If it does, start them "
+            "nearer to where they rest, set a restitution of 0, or densities less far apart",
         },
+        measured_by={"rigid": "max_penetration"},
     ),
     CountedEvent(
         "squeezed",

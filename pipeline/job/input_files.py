@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from pipeline.model.groups import written_place
 from pipeline.model.job import Job
 from pipeline.model.meshes import mesh_shapes
 from pipeline.model.positions import KeyPath
@@ -24,8 +25,11 @@ class InputFile:
 
 def input_files(job: Job) -> Iterator[InputFile]:
     """Every file that the job reads, meshes first."""
+    found: dict[KeyPath, str] = {}
     for place, shape in mesh_shapes(job):
-        yield InputFile((*place, "file"), shape.file, "mesh")
+        found.setdefault((*written_place(job, place), "file"), shape.file)
+    for place, file in found.items():
+        yield InputFile(place, file, "mesh")
     if job.set.hdri is not None:
         yield InputFile(("set", "hdri"), job.set.hdri, "picture")
     if job.set.backplate is not None:

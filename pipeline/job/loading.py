@@ -19,7 +19,7 @@ from pipeline.job.overrides import Override, OverrideError, apply_overrides, par
 from pipeline.job.presets import preview_overrides
 from pipeline.job.standing import StandingPart
 from pipeline.model.job import Job
-from pipeline.model.meshes import with_value
+from pipeline.model.meshes import with_written
 from pipeline.model.problems import JobSource
 
 MAX_BYTES = 2**20
@@ -60,8 +60,10 @@ class InvalidJobError(JobFileError):
     def standing_job(self) -> Job | None:
         """The part of the job that stands, its files absolute; None if nothing does."""
         job = self.standing.job
-        for change in [] if job is None else _absolute_files(job, self.path):
-            job = with_value(job, change.path, change.value)
+        if job is None:
+            return None
+        for change in _absolute_files(job, self.path):
+            job = with_written(job, change.path, change.value)
         return job
 
 
@@ -266,7 +268,7 @@ def _with_absolute_files(job: Job, text: str, path: Path) -> tuple[Job, str]:
         return job, text
     text = changed_text(text, changes)
     for change in changes:
-        job = with_value(job, change.path, change.value)
+        job = with_written(job, change.path, change.value)
     _remember(text, job)
     return job, text
 

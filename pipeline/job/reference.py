@@ -72,9 +72,10 @@ def _table_of(path: str, property_: schema.Node) -> tuple[schema.Node | None, st
     """The table that a property holds, one or many, and how its header is written."""
     definitions = schema.job_schema()["$defs"]
     options = [option for option in property_.get("anyOf", ()) if option.get("type") != "null"]
+    tables = options if len(options) == 1 else [option for option in options if "$ref" in option]
     for node, heading in (
         (property_, f"[{path}]"),
-        (options[0] if len(options) == 1 else None, f"[{path}]"),
+        (tables[0] if tables else None, f"[{path}]"),
         (property_.get("items"), f"[[{path}]]"),
         (property_.get("additionalProperties"), f"[{path}.NAME]"),
     ):

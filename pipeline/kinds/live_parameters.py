@@ -97,7 +97,8 @@ def _of_body(kind: str, heading: str, number: int, body: Any, rows: Iterable[Row
     for key, label, widget, low, high in rows:
         value = getattr(body, key)
         if value is not None:
-            name, folder, path = f"{kind}.{body.name}.{key}", f"{heading} {body.name}", (kind, number, key)
+            called = getattr(body, "group", body.name)  # a group's bodies share the value
+            name, folder, path = f"{kind}.{called}.{key}", f"{heading} {called}", (kind, number, key)
             yield Parameter.within(name, label, folder, widget, path, ends=(low, high), start=value)
 
 
@@ -156,9 +157,10 @@ def _of_rigid(job: Job, _written: Job) -> Iterator[Parameter]:
     """
     falls = any(body.kind == "dynamic" for body in job.rigid)
     rubs = falls or (bool(job.cloth) and (not job.fluid or bool(job.moving_bodies)))
-    for number, body in enumerate(job.rigid):
+    tables = {body.table: body for body in reversed(job.rigid)}
+    for table, body in sorted(tables.items()):
         rows = [DENSITY] * (not body.ballast) + [FRICTION] * rubs + [RESTITUTION] * falls
-        yield from _of_body("rigid", "Body", number, body, rows)
+        yield from _of_body("rigid", "Body", table, body, rows)
 
 
 def _set_rigid(solver: Any, body: str, key: str, value: Any, before: Any) -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from math import cos, radians, sin
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath
 from pipeline.kinds.base import Display, Kind, Materials, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import RIGID_LIVE
@@ -42,7 +45,7 @@ def _objects(_job: Job, layout: JobLayout, body: RigidBodyParameters, material_o
     """A static body stands where the job puts it; the others are where the poses of the frame say."""
     for part in parts_of(body.shape.type):
         name = body.name if part == BODY else f"{body.name}.{part}"
-        file, material = layout.body_mesh(body.name, part), material_of(part)
+        file, material = layout.body_mesh(body.model, part), material_of(part)
         if body.kind == "static":
             orientation = _orientation(body.rotation_deg)
             yield MeshObject(name=name, file=file, position=body.position, orientation=orientation, material=material)
@@ -69,10 +72,21 @@ def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.
     return reach_of_points(position + rotated(orientation, rest_vertices(layout, body)))
 
 
+def meshes_at_rest(bodies: Iterable[RigidBodyParameters]) -> tuple[ArtifactPath, ...]:
+    """Files of the meshes of bodies at rest, each once."""
+    files = (JobLayout.body_mesh(body.model, part) for body in bodies for part in parts_of(body.shape.type))
+    return tuple(dict.fromkeys(files))
+
+
 def rest_vertices(layout: JobLayout, body: RigidBodyParameters) -> NDArray[np.float64]:
     """Vertices of all parts of a body at rest [m], (n, 3)."""
-    files = [layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
-    return np.concatenate([read_ply(layout.path(file)).vertices for file in files]).astype(np.float64)
+    paths = [layout.path(file) for file in meshes_at_rest([body])]
+    return np.concatenate([_vertices(path, path.stat().st_mtime_ns) for path in paths]).astype(np.float64)
+
+
+@lru_cache(maxsize=64)  # bodies of a group share them
+def _vertices(path: Path, _mtime_ns: int) -> NDArray[np.float32]:
+    return read_ply(path).vertices
 
 
 RIGID = Kind(

@@ -179,16 +179,20 @@ def material_of(job: Job, body: str, part: str = BODY) -> MaterialParameters:
 
 
 def described_material(job: Job, body: str, part: str = BODY) -> MaterialParameters:
-    """The same with every key that the job file gives, also those that have no effect."""
+    """The same with every key that the job file gives, also those that have no effect.
+
+    A table of the body's own name counts most, then that of its group, then those of names with `*`.
+    """
     usual = _usual_material(job, body, part)
     if part != BODY and part not in WHITEWATER:
         look = (of_body := described_material(job, body)).look
         # Drops of a clear liquid are too small to refract in a picture; those of others look like it.
         keeps = (not look or LOOK_TABLE[look].refracts) if part in POINTS else look and LOOK_TABLE[look].paints_parts
         usual = usual if keeps else of_body
-    name = body if part == BODY else f"{body}.{part}"
-    said = [material for written, material in job.material.items() if written != name and is_meant(written, name)]
-    for material in [*said, job.material.get(name)]:
+    ending = "" if part == BODY else f".{part}"
+    names = tuple(f"{each}{ending}" for each in dict.fromkeys((job.groups.get(body, body), body)))
+    said = [job.material[written] for written in job.material if written not in names and is_meant(written, names[-1])]
+    for material in [*said, *(job.material.get(name) for name in names)]:
         usual = usual if material is None else material.upon(usual)
     return usual
 
@@ -203,5 +207,7 @@ def _usual_material(job: Job, name: str, part: str) -> MaterialParameters:
     """Material of a part of a body that the job file does not describe."""
     if part in POINTS:
         return POINTS[part]
-    found = next((kind.material(body) for _, kind, body in bodies(job) if body.name == name), {BODY: SOLID})
+    name = job.groups.get(name, name)
+    there = (kind.material(body) for _, kind, body in bodies(job) if getattr(body, "group", body.name) == name)
+    found = next(there, {BODY: SOLID})
     return found.get(part, found[BODY])

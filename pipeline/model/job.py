@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from pipeline.model.limits import LimitParameters
 from pipeline.model.problems import unknown_name
@@ -63,6 +63,8 @@ class Job(SceneParameters):
         description="When a stage's tasks are ended and tried again, by its name: [limits.render].",
     )
 
+    _groups: dict[str, str] = PrivateAttr(default_factory=dict)
+
     @property
     def frame_count(self) -> int:
         """Number of frames; frame k shows t = k / fps, and frame 0 the start."""
@@ -97,6 +99,16 @@ class Job(SceneParameters):
     def moving_bodies(self) -> tuple[str, ...]:
         """Names of the rigid bodies whose pose changes from frame to frame."""
         return tuple(body.name for body in self.rigid if body.kind != "static")
+
+    @property
+    def groups(self) -> dict[str, str]:
+        """The group of each body that is of one, by its name."""
+        return self._groups
+
+    @model_validator(mode="after")
+    def _know_groups(self) -> Self:
+        self._groups = {body.name: body.group for body in self.rigid if body.group != body.name}
+        return self
 
     @property
     def placed_camera(self) -> CameraParameters:

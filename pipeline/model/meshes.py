@@ -5,6 +5,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from sim.shapes.parameters import MeshShape
 
@@ -19,6 +20,15 @@ def mesh_shapes(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, MeshS
     elif isinstance(value, tuple):
         for index, child in enumerate(value):
             yield from mesh_shapes(child, (*path, index))
+
+
+def with_written(job: Job, path: KeyPath, new: object) -> Job:
+    """A job with another value at a place of its file, for all bodies that the table there makes; none is validated."""
+    if path[:1] != ("rigid",):
+        changed: Job = with_value(job, path, new)
+        return changed
+    bodies = tuple(with_value(body, path[2:], new) if body.table == path[1] else body for body in job.rigid)
+    return job.model_copy(update={"rigid": bodies})
 
 
 def with_value(value: Any, path: KeyPath, new: object) -> Any:

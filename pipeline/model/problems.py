@@ -5,11 +5,14 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import count
 
 from pipeline.model.positions import KeyPath, locate_keys
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _CLOSE_ENOUGH = 0.6
+MOST_LISTED = 20
+"""Names that a sentence lists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +102,11 @@ def suggestion(word: object, known: Iterable[str]) -> str:
 def unknown_name(name: str, known: Iterable[str], kind: str, *, plural: str = "", none: str = "") -> str:
     """Sentence that no body of a kind has a name, with the names that may be meant, or what to do if there are none."""
     names = list(known)
-    listed = f"; {plural or f'{kind}s'} are {', '.join(names)}" if names else none
+    if f"{name}_1" in (taken := set(names)):
+        last = next(number for number in count(1) if f"{name}_{number + 1}" not in taken)
+        return f'"{name}" is a group of {last:,}; name one {kind} of it, "{name}_1" to "{name}_{last}"'
+    few = names if len(names) <= MOST_LISTED else [*names[:MOST_LISTED], f"{len(names) - MOST_LISTED:,} more"]
+    listed = f"; {plural or f'{kind}s'} are {', '.join(few)}" if names else none
     return f'no {kind} is named "{name}"{suggestion(name, names) or listed}'
 
 

@@ -23,6 +23,10 @@ from sim.core.solver import Diagnostics
 SIMULATE = "simulate"  # the stage whose artifacts are frames of the cache
 WHITEWATER = "whitewater"
 LINE_WIDTH = 100
+NUMBERS_OF_WARNINGS = [event.name for event in WARNINGS] + [
+    measure for event in WARNINGS for measure in event.measured_by.values()
+]
+"""What `count_warnings` needs of a frame."""
 _TIED = "\N{NO-BREAK SPACE}"
 
 
@@ -70,13 +74,19 @@ class CountedWarning:
     event: CountedEvent
     count: int
     frames: tuple[int, ...]
+    worst: float | None = None  # the largest number in these frames of what the event is measured by
 
     def __str__(self) -> str:
         """`water: 3 solves hit their iteration limit, frames 12, 15-16`, and what that means."""
         plural = "s" if len(self.frames) > 1 else ""
         told = f"{self.solver}: {self.event.text(self.count)}, frame{plural} {_ranges(self.frames)}"
         meaning = self.event.means.get(self.kind)
-        return f"{told}: {meaning}" if meaning else told
+        if meaning is None:
+            return told
+        measure = self.event.measured_by.get(self.kind)
+        if measure is not None:
+            meaning = meaning.format(worst=quantity(measure, of_kind=self.kind).text(self.worst or 0.0))
+        return f"{told}: {meaning}"
 
     def as_json(self) -> dict[str, object]:
         """For machines."""
@@ -96,7 +106,7 @@ def simulation_numbers(layout: JobLayout, *, history: bool = False) -> Simulatio
 
     Raises ManifestError: the record, which tells the fluids with whitewater, cannot be read.
     """
-    only = None if history else [event.name for event in WARNINGS]
+    only = None if history else NUMBERS_OF_WARNINGS
     receipts = of_newest({_frame_of(each.artifact): each for each in _receipts(layout, layout.frame_cache(0))})
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         whitewater, unreadable_files = _whitewater_numbers(layout, receipts, manifest.subjects(WHITEWATER))
@@ -135,6 +145,7 @@ def describe(numbers: FrameNumbers) -> list[str]:
 def count_warnings(frames: Iterable[FrameNumbers]) -> list[CountedWarning]:
     """What happened in these frames that should not, by solver."""
     counts: dict[tuple[str, str, CountedEvent], dict[int, int]] = {}
+    measured: dict[tuple[str, str, CountedEvent], float] = {}
     totals: dict[tuple[str, CountedEvent], int] = {}
     for each in frames:
         for solver, event, count in _events_of(each.solvers):
@@ -143,7 +154,15 @@ def count_warnings(frames: Iterable[FrameNumbers]) -> list[CountedWarning]:
             if news > 0:
                 kind = each.kinds.get(solver, solver)  # solvers of several bodies have the names of their kinds
                 counts.setdefault((solver, kind, event), {})[each.frame] = news
-    return [CountedWarning(*of, sum(news.values()), tuple(news)) for of, news in counts.items()]
+                if (worst := _measured(event, kind, each.solvers[solver])) is not None:
+                    measured[solver, kind, event] = max(worst, measured.get((solver, kind, event), 0.0))
+    return [CountedWarning(*of, sum(news.values()), tuple(news), measured.get(of)) for of, news in counts.items()]
+
+
+def _measured(event: CountedEvent, kind: str, of: Diagnostics) -> float | None:
+    """How bad an event was by a solver's numbers, if it is measured."""
+    measure = event.measured_by.get(kind)
+    return None if measure is None else of.get(measure)
 
 
 def unreadable_whitewater(files: Iterable[ArtifactPath]) -> list[str]:
@@ -182,7 +201,9 @@ class SolverWatch:
         for solver, happened, count in _events_of(solvers):
             if (solver, happened.name) not in self._told:
                 self._told.add((solver, happened.name))
-                warning = CountedWarning(solver, kinds.get(solver, solver), happened, count, (_frame_of(artifact),))
+                kind, frame = kinds.get(solver, solver), _frame_of(artifact)
+                worst = _measured(happened, kind, solvers[solver])
+                warning = CountedWarning(solver, kind, happened, count, (frame,), worst)
                 self._say(f"{warning}; later ones are counted: pipeline status")
 
 

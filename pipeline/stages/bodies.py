@@ -34,14 +34,17 @@ MOST_TRIANGLES = 500_000
 
 
 class BodiesStage(Stage):
-    """One PLY per rigid body and part of its shape, in its rest pose, wherever it stands in the scene."""
+    """One PLY per rigid body and part of its shape, in its rest pose, wherever it stands in the scene.
+
+    Bodies of a group that are of one size have one together, that of the first of them.
+    """
 
     name = "bodies"
     about = "meshes of rigid bodies"
     version = 3
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
-        """One task a body."""
+        """One task a body that is not another's copy."""
         return [
             Task(
                 id=TaskId(f"bodies/{body.name}"),
@@ -60,6 +63,7 @@ class BodiesStage(Stage):
                 subject=body.name,
             )
             for body in job.rigid
+            if body.is_own_model
         ]
 
     def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
@@ -107,12 +111,23 @@ def mesh_within(solid: PlacedSolid, max_edge: float, *, most: int) -> TriangleMe
 
 def _longest_edge(job: Job, body: RigidBodyParameters) -> float | None:
     """Longest edge that its mesh may have [m], if it is one that fluids are seen through."""
-    look = material_of(job, body.name).look
-    if look is None or not LOOK_TABLE[look].refracts or not job.fluid:
+    if not job.fluid or not any(_refracts(job, each) for each in _copies(job, body)):
         return None
     return EDGE_IN_RADII * min(fluid.particle_radius for fluid in job.fluid)
 
 
 def _is_textured(job: Job, body: RigidBodyParameters) -> bool:
     """Whether its file's texture coordinates are kept: a material of a .blend file may hang pictures on them."""
-    return isinstance(body.shape, MeshShape) and material_of(job, body.name).blend is not None
+    if not isinstance(body.shape, MeshShape):
+        return False
+    return any(material_of(job, each.name).blend is not None for each in _copies(job, body))
+
+
+def _refracts(job: Job, body: RigidBodyParameters) -> bool:
+    look = material_of(job, body.name).look
+    return look is not None and LOOK_TABLE[look].refracts
+
+
+def _copies(job: Job, body: RigidBodyParameters) -> list[RigidBodyParameters]:
+    """The bodies that have its mesh, itself first."""
+    return [body] if body.group == body.name else [each for each in job.rigid if each.model == body.name]

@@ -11,11 +11,10 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Resources, Task, TaskId
 from pipeline.kinds.base import Work
-from pipeline.kinds.rigid import rest_vertices
+from pipeline.kinds.rigid import meshes_at_rest, rest_vertices
 from pipeline.kinds.table import bodies, scene_boxes
 from pipeline.model.boxes import ALL, overlap, simulated_regions
 from pipeline.model.job import Job
-from pipeline.model.looks import parts_of
 from pipeline.stages.base import FILE_S, FileWork, Stage, TaskContext
 from pipeline.store.cache import open_bodies
 from render.bounds import (
@@ -54,12 +53,7 @@ class BoundsStage(Stage):
             return []
         tools = {"numpy": tool_version("numpy")}
         of_frames = ParameterSet.of(stage=self.name, version=self.version, tools=tools)
-        meshes = tuple(
-            layout.body_mesh(body.name, part)
-            for body in job.rigid
-            if body.kind != "static"
-            for part in parts_of(body.shape.type)
-        )
+        meshes = meshes_at_rest([body for body in job.rigid if body.kind != "static"])
         # Bodies are read one after the other; the cells of a smoke are few bytes each, and only one smoke's at a time.
         in_memory = BASE_BYTES + sum(kind.reach_bytes * kind.elements(job, body) for _, kind, body in bodies(job))
         resources = Resources(memory_bytes=int(in_memory))
@@ -80,7 +74,7 @@ class BoundsStage(Stage):
             id=FILM,
             stage=self.name,
             inputs=(
-                *(layout.body_mesh(body.name, part) for body in static for part in parts_of(body.shape.type)),
+                *meshes_at_rest(static),
                 *(task.outputs[0] for task in frames),
             ),
             outputs=(layout.film_bounds(),),

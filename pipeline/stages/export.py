@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Mapping
 from copy import copy
 from pathlib import PurePosixPath
 from typing import Self
@@ -11,14 +11,13 @@ from pipeline.base.errors import PlanError
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
 from pipeline.model.job import Job
-from pipeline.model.looks import parts_of
 from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.render_scene import camera_path, framed_points, view_at
 from pipeline.store.cache import read_frame
 from render.camera_path import View
+from render.meshes import SurfaceMesh, read_ply
 from render.poses import Placement
 from render.spec import MovingMeshObject, RenderSpec, VolumeSequenceObject
-from sim.rigid.parameters import RigidBodyParameters
 
 PREFIX = "export-"  # begins the names of these stages; that of the format follows
 
@@ -109,8 +108,7 @@ def frame_of(artifact: ArtifactPath) -> int:
     return int(PurePosixPath(artifact).stem)
 
 
-def meshes_of(job: Job) -> Iterator[tuple[RigidBodyParameters, str, ArtifactPath]]:
-    """Every part of every rigid body with its mesh at rest."""
-    for body in job.rigid:
-        for part in parts_of(body.shape.type):
-            yield body, part, JobLayout.body_mesh(body.name, part)
+def read_meshes(layout: JobLayout, files: Mapping[str, str]) -> dict[str, SurfaceMesh]:
+    """Meshes at rest of objects by name, of their files in the job's folder; objects of one file share it."""
+    read = {file: read_ply(layout.root / file) for file in dict.fromkeys(files.values())}
+    return {name: read[file] for name, file in files.items()}

@@ -10,10 +10,11 @@ from pathlib import Path
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.kinds.rigid import meshes_at_rest
 from pipeline.kinds.table import points_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.export import ExportStage, meshes_of
+from pipeline.stages.export import ExportStage
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render import CORES, WORKER_BYTES, RenderStage, decisive
 from pipeline.stages.render_drawing import FrameDrawing
@@ -43,7 +44,7 @@ class _SceneExport(ExportStage):
         """The task that writes the file; beside meshes at rest and poses it reads these."""
         frames = self.chosen(job)
         cached = [layout.frame_cache(frame) for frame in frames] if job.moving_bodies else []
-        meshes = [mesh for _, _, mesh in meshes_of(job)]
+        meshes = [*meshes_at_rest(job.rigid)]
         return Task(
             id=TaskId(f"{self.name}/scene"),
             stage=self.name,
@@ -88,7 +89,7 @@ class BlendExport(_SceneExport):
         spec = render_spec(job, layout)
         fluids = _wet(spec.objects)
         frames = self.chosen(job)
-        meshes = [mesh for _, _, mesh in meshes_of(job)]
+        meshes = [*meshes_at_rest(job.rigid)]
         parameters = ParameterSet.of(
             stage=self.name,
             version=self.version,

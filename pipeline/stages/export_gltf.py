@@ -9,10 +9,11 @@ from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.kinds.rigid import meshes_at_rest
 from pipeline.kinds.table import products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.export import ExportStage, meshes_of, motion
+from pipeline.stages.export import ExportStage, motion, read_meshes
 from pipeline.stages.render_scene import framed_points, framing_files, render_spec
 from render.gltf_files import TooLargeError, validate_glb, write_glb
 from render.meshes import SurfaceMesh, read_ply
@@ -57,7 +58,7 @@ class GltfExport(ExportStage):
             inputs=(
                 *(path for path in played if not path.endswith(".vdb")),
                 *poses,
-                *(mesh for _, _, mesh in meshes_of(job)),
+                *meshes_at_rest(job.rigid),
                 *framing_files(job, layout),
             ),
             outputs=(self.root(job),),
@@ -96,7 +97,7 @@ class GltfExport(ExportStage):
                     path,
                     spec,
                     times=[(frame - frames[0]) / job.fps for frame in frames],
-                    meshes={each.name: read_ply(layout.root / each.file) for each in still},
+                    meshes=read_meshes(layout, {each.name: each.file for each in still}),
                     sequences={each.name: played(each) for each in changing},
                     placements={name: list(by_frame.values()) for name, by_frame in placements.items()},
                     views=list(views.values()),

@@ -9,10 +9,11 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
 from pipeline.kinds.base import Kind
+from pipeline.kinds.rigid import meshes_at_rest
 from pipeline.kinds.table import bodies, drawn_bodies, material_of, points_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.export import ExportStage, frame_of, meshes_of, motion
+from pipeline.stages.export import ExportStage, frame_of, motion, read_meshes
 from pipeline.stages.render_scene import framed_points, framing_files, render_spec
 from pipeline.store.cache import read_compact
 from render.meshes import read_ply
@@ -66,7 +67,7 @@ class UsdExport(ExportStage):
                 *(task.outputs[0] for task in tasks),
                 *volumes,
                 *poses,
-                *(mesh for _, _, mesh in meshes_of(job)),
+                *meshes_at_rest(job.rigid),
                 *(layout.product("cloths", cloth.name, frames[0], ".ply") for cloth in job.cloth),
                 *framing_files(job, layout),
             ),
@@ -144,11 +145,10 @@ def _write_scene(context: TaskContext) -> None:
     job, layout, task = context.job, context.layout, context.task
     spec = render_spec(job, layout, framed_points(job, layout))
     layers = {frame_of(each): each for each in task.inputs if each.startswith(f"{FOLDER}/")}
-    meshes = {}
+    bodies_at_rest = [each for each in spec.objects if isinstance(each, MeshObject | MovingMeshObject)]
+    meshes = read_meshes(layout, {each.name: each.file for each in bodies_at_rest})
     for each in spec.objects:
-        if isinstance(each, MeshObject | MovingMeshObject):
-            meshes[each.name] = read_ply(layout.root / each.file)
-        elif isinstance(each, MeshSequenceObject) and each.name in {cloth.name for cloth in job.cloth}:
+        if isinstance(each, MeshSequenceObject) and each.name in {cloth.name for cloth in job.cloth}:
             meshes[each.name] = read_ply(layout.root / each.file.replace("{frame}", f"{min(layers):06d}"))
     placements, views = motion(context, spec, layers)
     with (

@@ -12,11 +12,12 @@ import numpy as np
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.kinds.rigid import meshes_at_rest
 from pipeline.kinds.stored_arrays import unit_of
 from pipeline.kinds.table import bodies, points_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.export import ExportStage, frame_of, meshes_of
+from pipeline.stages.export import ExportStage, frame_of
 from pipeline.store.cache import read_compact
 from render.meshes import read_ply
 from render.point_clouds import read_point_cloud
@@ -45,7 +46,7 @@ class VtkExport(ExportStage):
             version=self.version,
             tools={},
         )
-        meshes = [mesh for _, _, mesh in meshes_of(job)]
+        meshes = meshes_at_rest(job.rigid)
         tasks = []
         for frame in self.chosen(job):
             surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
@@ -143,9 +144,7 @@ class _Frame:
         write_polydata(path, position, triangles=triangles, point_values=values, time_s=self._time_s)
 
     def _parts(self, path: Path, *, body: Any) -> None:
-        meshes = [
-            read_ply(self._layout.path(mesh)) for owner, _, mesh in meshes_of(self._job) if owner.name == body.name
-        ]
+        meshes = [read_ply(self._layout.path(mesh)) for mesh in meshes_at_rest([body])]
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         rest = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float64)
         triangles = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)])

@@ -13,6 +13,7 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.job.input_files import split_blend
 from pipeline.kinds.base import Work
+from pipeline.kinds.rigid import meshes_at_rest
 from pipeline.kinds.table import KINDS, material_of, points_of, products_of
 from pipeline.model.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.model.job import Job
@@ -94,8 +95,7 @@ class RenderStage(Stage):
             memory_bytes=renderer_bytes + bytes_per_pixel * prod(job.render.resolution),
             gpus=int(_draws_on_gpus(job)),
         )
-        static = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
-        static += framing_files(job, layout)
+        static = [*meshes_at_rest(job.rigid), *framing_files(job, layout)]
         return [
             Task(
                 id=TaskId(f"render/{frame:06d}"),
@@ -272,7 +272,7 @@ def _without_coordinates(job: Job, layout: JobLayout) -> Iterator[tuple[str, str
     for body in job.rigid:
         for part in parts_of(body.shape.type):
             material = material_of(job, body.name, part)
-            mesh = layout.path(layout.body_mesh(body.name, part))
+            mesh = layout.path(layout.body_mesh(body.model, part))
             if material.blend is not None and read_ply(mesh).corner_uv is None:
                 yield body.name if part == BODY else f"{body.name}.{part}", material.blend
     for fluid in job.fluid:

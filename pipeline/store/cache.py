@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.kinds.smoke_codec import read_density
 from pipeline.kinds.stored_arrays import read_array, unit_of, write_array
+from pipeline.store.body_groups import BodyGroup, BodyGroups, OneOfGroup, packed
 from sim.core.snapshots import Attribute, Snapshot
 from sim.core.solver import Diagnostics
 from sim.core.world import FrameReport
@@ -86,7 +87,7 @@ def write_frame(
         file.attrs["frame"] = report.frame
         file.attrs["time_s"] = report.time_s
         file.attrs["device"] = device
-        for name, snapshot in bodies.items():
+        for name, snapshot in packed(bodies).items():
             group = file.create_group(f"bodies/{name}")
             group.attrs["kind"] = snapshot.kind
             for key, value in snapshot.attributes.items():
@@ -111,14 +112,15 @@ def write_frame(
 def read_frame(path: Path, body: str | None = None, *, kind: str | None = None) -> CachedFrame:
     """Read one frame, or one body of it, or its bodies of one kind; errors as of `open_bodies`."""
     with _frame(path) as file:
-        names = [body] if body is not None else list(file.get("bodies", {}))
+        groups = BodyGroups(file.get("bodies", {}))
+        names = [body] if body is not None else list(groups)
         if kind is not None:
-            names = [name for name in names if file["bodies"][name].attrs["kind"] == kind]
+            names = [name for name in names if _kind_of(groups[name]) == kind]
         return CachedFrame(
             frame=int(file.attrs["frame"]),
             time_s=float(file.attrs["time_s"]),
             device=str(file.attrs["device"]),
-            bodies={name: _read_body(file["bodies"][name]) for name in names},
+            bodies={name: _read_body(groups[name]) for name in names},
             diagnostics=_read_diagnostics(file),
         )
 
@@ -131,13 +133,13 @@ def read_compact(path: Path, body: str) -> Any:
 
 
 @contextmanager
-def open_bodies(path: Path) -> Iterator[h5py.Group]:
+def open_bodies(path: Path) -> Iterator[BodyGroups]:
     """The groups of a frame's bodies, by name.
 
     Raises InvalidArtifactError: the file is truncated, damaged or of another format.
     """
     with _frame(path) as file:
-        yield file.get("bodies", {})
+        yield BodyGroups(file.get("bodies", {}))
 
 
 def read_smoke_density(path: Path, name: str) -> tuple[NDArray[np.float32], tuple[float, float, float], float]:
@@ -154,7 +156,7 @@ def read_numbers(path: Path, only: Collection[str] | None = None) -> FrameNumber
             time_s=float(file.attrs["time_s"]),
             device=str(file.attrs["device"]),
             solvers=_read_diagnostics(file, only),
-            kinds={name: _kind_of(group) for name, group in file.get("bodies", {}).items()},
+            kinds=BodyGroups(file.get("bodies", {})).kinds(),
         )
 
 
@@ -260,7 +262,9 @@ def _digest(checkpoint: Checkpoint) -> str:
     return hasher.hexdigest()
 
 
-def _read_body(group: h5py.Group) -> Snapshot:
+def _read_body(group: BodyGroup) -> Snapshot:
+    if isinstance(group, OneOfGroup):
+        return group.snapshot()
     attributes: dict[str, Attribute] = {}
     for key, value in group.attrs.items():
         if key != "kind":
@@ -278,12 +282,12 @@ def _codec_of(kind: str) -> Codec | None:
     return None if row is None or row.codec is None else row.codec()
 
 
-def _sparse(group: h5py.Group) -> Mapping[str, Iterable[Any]]:
+def _sparse(group: BodyGroup) -> Mapping[str, Iterable[Any]]:
     codec = _codec_of(_kind_of(group))
     return {} if codec is None else codec.sparse(group)
 
 
-def _kind_of(group: h5py.Group) -> str:
+def _kind_of(group: BodyGroup) -> str:
     return str(group.attrs["kind"])
 
 

@@ -28,6 +28,7 @@ class KeyRefusedError(ValueError):
         self.path = path
 
 
+LONGEST_NAME_LETTERS = 64
 LONGEST_NAME_BYTES = 200
 """Of UTF-8: folders and files are called like bodies, and get endings."""
 

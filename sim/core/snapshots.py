@@ -32,6 +32,7 @@ class Snapshot:
     kind: str
     arrays: Mapping[str, NDArray[np.generic]]
     attributes: Mapping[str, Attribute]
+    group: str | None = None  # name of the group that a rigid body is of, or its own
 
     def number(self, attribute: str) -> float:
         """A scalar attribute. Raises KeyError when there is none, TypeError when it is not a number."""

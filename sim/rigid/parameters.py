@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from math import prod
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
-from sim.core.parameters import BodyName, Fraction, NonNegative, Vector3
+from sim.core.parameters import BodyName, Fraction, KeyRefusedError, NonNegative, Positive, Vector3
+from sim.rigid.group_parameters import CurveParameters, JitterParameters, ScatterParameters
 from sim.shapes.parameters import WeightedPlacement
+
+MOST_OF_A_GROUP = 100_000
+PLACES = ("spacing", "along", "scatter")
+"""Keys of which a group has one: they say where its bodies are."""
+
+Count = Annotated[int, Field(ge=1, le=MOST_OF_A_GROUP)]
 
 
 class RigidBodyParameters(WeightedPlacement):
-    """A rigid body: fixed, moved along a path, or moved by forces and contacts."""
+    """A rigid body: fixed, moved along a path, or moved by forces and contacts; or a group of such bodies.
+
+    A table with `count` is a group: its bodies share all other keys.
+    """
 
     name: BodyName = Field(description="Name of the body, unique in the job.")
     kind: Literal["static", "kinematic", "dynamic"] = Field(
@@ -44,6 +55,97 @@ class RigidBodyParameters(WeightedPlacement):
         description="Between keyframes. cubic: velocities are continuous; linear: they are constant and jump.",
     )
 
+    # A group's keys are spent once its bodies are there, so that nothing of them is in what decides a frame.
+    count: Count | tuple[Count, Count, Count] | None = Field(
+        default=None,
+        exclude=True,
+        description="Makes a group of so many bodies [-], named NAME_1, NAME_2, ...: one number, or those along x, y "
+        "and z of a lattice, of which the first body is at the position. The rotation turns the lattice, too.",
+    )
+    spacing: Positive | Vector3 | None = Field(
+        default=None,
+        exclude=True,
+        description="Of a group: from one centre to the next [m], along x (one number, and one count), along x, y and "
+        "z of a lattice, or three numbers for one count: the way from each body to the next.",
+    )
+    offset: Vector3 = Field(
+        default=(0.0, 0.0, 0.0),
+        exclude=True,
+        description="How far every second storey of a lattice is shifted [m]: half a brick for a wall in bond.",
+    )
+    along: CurveParameters | None = Field(
+        default=None, exclude=True, description="Instead of spacing: a curve that the bodies of a group stand on."
+    )
+    scatter: ScatterParameters | None = Field(
+        default=None,
+        exclude=True,
+        description="Instead of spacing: a shape that the bodies of a group are scattered in, clear of each other and "
+        "of other scattered bodies.",
+    )
+    jitter: JitterParameters | None = Field(
+        default=None, exclude=True, description="How much the bodies of a group are out of line."
+    )
+    scales: tuple[Positive, Positive] | None = Field(
+        default=None,
+        exclude=True,
+        description="Smallest and largest size of the bodies of a group, times scale [-]: each has one of eight sizes "
+        "between, by chance.",
+    )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        exclude=True,
+        description="Of a group: another number gives other places, turns and sizes where chance has a part in them.",
+    )
+    _table: int | None = PrivateAttr(default=None)
+    _group: str | None = PrivateAttr(default=None)
+    _model: str | None = PrivateAttr(default=None)
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether it is one of the bodies of a job, not a table that may make many."""
+        return self._table is not None
+
+    @property
+    def table(self) -> int:
+        """Which of the job's tables it comes from."""
+        assert self._table is not None, "the bodies of a job know their table"
+        return self._table
+
+    @property
+    def group(self) -> str:
+        """Name of the group that it is of; its own if it is of none."""
+        return self._group or self.name
+
+    @property
+    def model(self) -> str:
+        """Name of the body whose mesh it shares: the first of its group of that size; its own if it is of none."""
+        return self._model or self.name
+
+    @property
+    def is_own_model(self) -> bool:
+        """Whether its mesh is not that of another body."""
+        return self.model == self.name
+
+    @property
+    def body_count(self) -> int:
+        """How many bodies the table makes."""
+        if self.count is None:
+            return 1
+        return self.count if isinstance(self.count, int) else prod(self.count)
+
+    def placed(self, table: int, *, model: str | None = None, **values: Any) -> Self:
+        """A body of a table of this number, with other values; one of a group with the name of its model."""
+        body = self
+        if model is not None:
+            spent = ("count", "spacing", "along", "scatter", "jitter", "scales")
+            body = self.model_copy(update={**dict.fromkeys(spent), "offset": (0.0, 0.0, 0.0), "seed": 0, **values})
+            body._group, body._model = self.name, model
+        else:
+            body = self.model_copy()
+        body._table = table
+        return body
+
     @model_validator(mode="before")
     @classmethod
     def _start_at_first_keyframe(cls, data: Any) -> Any:
@@ -71,4 +173,29 @@ class RigidBodyParameters(WeightedPlacement):
         if "interpolation" in given and not self.keyframe:
             raise ValueError("interpolation has no meaning without keyframes; remove it or add [[rigid.keyframe]]")
         require_ascending_times(self.keyframe)
+        return self
+
+    @model_validator(mode="after")
+    def _has_one_way_to_be_many(self) -> Self:
+        given = self.model_fields_set
+        if self.count is None:
+            for key in (*PLACES, "offset", "jitter", "scales", "seed"):
+                if key in given:
+                    raise KeyRefusedError((key,), "has no meaning for one body; add count, or remove it")
+            return self
+        if self.keyframe:
+            raise KeyRefusedError(("keyframe",), "would lead all bodies of a group through one place; give velocity")
+        if self.body_count > MOST_OF_A_GROUP:
+            raise KeyRefusedError(("count",), f"is {self.body_count:,} bodies; a group has {MOST_OF_A_GROUP:,} at most")
+        ways = [key for key in PLACES if getattr(self, key) is not None]
+        if len(ways) != 1:
+            what = f"{' and '.join(ways)} place the bodies" if ways else "nothing places the bodies"
+            raise KeyRefusedError(("count",), f"{what}; give one of {', '.join(PLACES)}")
+        is_lattice = not isinstance(self.count, int)
+        if is_lattice and self.spacing is None:
+            raise KeyRefusedError(("count",), f"of a lattice needs spacing; with {ways[0]} give one number")
+        if "offset" in given and not is_lattice:
+            raise KeyRefusedError(("offset",), "shifts storeys of a lattice; give three counts, or remove it")
+        if self.scales is not None and self.scales[0] > self.scales[1]:
+            raise KeyRefusedError(("scales",), f"has the smallest size first, got {self.scales[0]:g} before the other")
         return self

@@ -89,6 +89,8 @@ class RigidSolver:
             number: path_of(body) for number, body in enumerate(parameters) if body.kind == "kinematic"
         }
         self.bodies = _starting_bodies(parameters, self.solids)
+        self._groups = tuple(body.group for body in parameters)
+        self._centres = np.array([solid.centre_of_mass for solid in self.solids])
         self._place_kinematic_bodies(0.0)
 
         fixed = _geometries_of(obstacles)
@@ -380,14 +382,14 @@ class RigidSolver:
         turned = bodies.rotation()
         snapshots = {}
         for number, name in enumerate(bodies.names):
-            arm = -turned[number] @ self.solids[number].centre_of_mass
+            arm = -turned[number] @ self._centres[number]
             arrays = {
                 "position": bodies.position[number] + arm,
                 "orientation": bodies.orientation[number].copy(),
-                "velocity": bodies.velocity[number] + np.cross(bodies.angular_velocity[number], arm),
+                "velocity": bodies.velocity[number] + rotation.cross(bodies.angular_velocity[number], arm),
                 "angular_velocity": bodies.angular_velocity[number].copy(),
             }
-            snapshots[name] = Snapshot("rigid", arrays, {})
+            snapshots[name] = Snapshot("rigid", arrays, {}, self._groups[number])
         return snapshots
 
     def view(self, body: str) -> dict[str, NDArray[np.generic]]:

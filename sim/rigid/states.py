@@ -11,7 +11,7 @@ from sim.core.motion import rotation
 from sim.core.motion.rotation import Array
 from sim.core.snapshots import Snapshot
 from sim.rigid.parameters import RigidBodyParameters
-from sim.shapes.placement import build_solid
+from sim.shapes.placement import SharedShapes, build_solid
 
 _SEQUENCE = ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
 """Principal axes and shares of the step; the same forwards and backwards, hence second order and reversible."""
@@ -185,8 +185,9 @@ class StaticBody:
         ShapeError: its shape cannot be built.
     """
 
-    def __init__(self, parameters: RigidBodyParameters) -> None:
-        self.name, self.solid = parameters.name, build_solid(parameters)
+    def __init__(self, parameters: RigidBodyParameters, shapes: SharedShapes | None = None) -> None:
+        self.name, self.solid = parameters.name, build_solid(parameters, shapes)
+        self._group = parameters.group
 
     def snapshot(self) -> Snapshot:
         """Its pose: the same at every frame."""
@@ -196,4 +197,4 @@ class StaticBody:
             "velocity": np.zeros(3),
             "angular_velocity": np.zeros(3),
         }
-        return Snapshot("rigid", arrays, {})
+        return Snapshot("rigid", arrays, {}, self._group)

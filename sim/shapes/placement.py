@@ -74,8 +74,23 @@ class PlacedSolid:
         return self.shape.surface_mesh(None if max_edge is None else max_edge / self.scale)
 
 
-def build_solid(placement: Placement) -> PlacedSolid:
+class SharedShapes:
+    """Shapes about their own origins that were built, so that bodies of one shape share it."""
+
+    def __init__(self) -> None:
+        self._built: dict[Shape, RestShape] = {}
+
+    def of(self, shape: Shape) -> RestShape:
+        """The shape, built where it is new. Raises as `build_solid`."""
+        if shape not in self._built:
+            self._built[shape] = build_rest_shape(shape)
+        return self._built[shape]
+
+
+def build_solid(placement: Placement, shapes: SharedShapes | None = None) -> PlacedSolid:
     """The solid that a placement describes; a relative mesh path counts from the working directory.
+
+    Its shape is one of those that were built, if some are given.
 
     Raises:
         ShapeError: the shape cannot be built; the text gives place, rule, value and remedy.
@@ -83,7 +98,8 @@ def build_solid(placement: Placement) -> PlacedSolid:
     # Lower-case "xyz" are rotations about fixed world axes: R = Rz Ry Rx.
     rotation = Rotation.from_euler("xyz", placement.rotation_deg, degrees=True).as_matrix()
     position = np.asarray(placement.position, dtype=np.float64)
-    return PlacedSolid(build_rest_shape(placement.shape), placement.scale, rotation, position)
+    rest = build_rest_shape(placement.shape) if shapes is None else shapes.of(placement.shape)
+    return PlacedSolid(rest, placement.scale, rotation, position)
 
 
 def build_rest_shape(shape: Shape) -> RestShape:

@@ -13,10 +13,12 @@ JOBS = sorted((PROJECT / "jobs").glob("*.toml"))
 
 TINY = {
     "ball_into_cloth": {"cloth.sheet.shape.counts": [9, 9]},
+    "brick_wall_in_flood": {"fluid.water.particle_radius": 0.025, "rigid.brick.count": [1, 5, 2]},
     "campfire": {"smoke.fire.cell_size": 0.04},
     "cloth_over_bunny": {"cloth.veil.shape.counts": [11, 11]},
     "cloth_over_sphere": {"cloth.sheet.shape.counts": [11, 11]},
     "dam_break": {"fluid.water.particle_radius": 0.025},
+    "dominoes": {"rigid.domino.count": 12},
     "drop_on_bunny_dfsph": {"fluid.water.particle_radius": 0.05},
     "drop_on_bunny_wcsph": {"fluid.water.particle_radius": 0.05, "fluid.water.dt": 1.0e-3},
     "duck_in_pool_pcisph": {"fluid.water.particle_radius": 0.05},

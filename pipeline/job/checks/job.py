@@ -10,12 +10,13 @@ from pipeline.job.checks.optical_depth import check_optical_depths
 from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_set
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.kinds.base import Kind
-from pipeline.kinds.checks.memory_budget import MemoryBudget, memory_budget
+from pipeline.kinds.checks.memory_budget import MemoryBudget, free_bytes, memory_budget
 from pipeline.kinds.checks.rigid import check_joints
 from pipeline.kinds.checks.shapes import build_solids, in_scale
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.table import KINDS, bodies, described_material, is_meant, placements
 from pipeline.model.boxes import simulated_regions
+from pipeline.model.groups import of_tables
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, WHITEWATER
 from pipeline.model.positions import KeyPath
@@ -45,13 +46,17 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
     _check_pictures(job, findings)
     check_set(job, findings)
     if check_magnitudes(job, findings):
-        solids = in_scale(build_solids(placements(job), findings), simulated_regions(job), findings)
+        solids = in_scale(
+            build_solids(placements(job), findings, room_bytes=free_bytes()), simulated_regions(job), findings
+        )
         budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
         check_camera(job, solids, findings)
         for kind in KINDS.values():
             findings.elements[kind.name] = kind.check(job, solids, budget, findings) if kind.bodies(job) else 0
         if not findings.errors:
             check_optical_depths(job, findings)
+    for kind_of_problem in (findings.errors, findings.warnings, findings.facts):
+        kind_of_problem[:] = of_tables(job, kind_of_problem)
     return findings
 
 
@@ -87,9 +92,11 @@ def _check_whitewater(job: Job, findings: Findings) -> None:
 
 def _check_materials(job: Job, findings: Findings) -> None:
     kinds = {body.name: kind for _, kind, body in bodies(job)}
+    kinds |= dict.fromkeys(job.groups.values(), RIGID)
     for _, kind, body in bodies(job):
         unused = {BODY} if body.name in job.whitewater else {BODY, *WHITEWATER}
-        kinds |= {f"{body.name}.{part}": kind for part in kind.material(body) if part not in unused}
+        names = dict.fromkeys((body.name, job.groups.get(body.name, body.name)))
+        kinds |= {f"{name}.{part}": kind for name in names for part in kind.material(body) if part not in unused}
     for written, said in job.material.items():
         path: KeyPath = ("material", written)
         meant = [name for name in kinds if is_meant(written, name)]
@@ -99,6 +106,8 @@ def _check_materials(job: Job, findings: Findings) -> None:
             findings.error(path, unknown_name(written, kinds, "body", plural="bodies"))
         for name in meant:
             owner, _, part = name.partition(".")
+            if owner in job.groups and ".".join(filter(None, (job.groups[owner], part))) in meant:
+                continue  # what is said of its group is said of it
             material = described_material(job, owner, part or BODY)
             if said.blend is None and material.blend is not None:
                 check_keys_beside_blend(said, path, findings)

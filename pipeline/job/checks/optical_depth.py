@@ -59,5 +59,10 @@ def _check(job: Job, path: KeyPath, kind: Kind, body: Any, material: MaterialPar
 
 def _table_of(job: Job, name: str) -> KeyPath:
     """The table of materials that gives a body its density."""
-    tables = [written for written, said in job.material.items() if said.density is not None and is_meant(written, name)]
-    return ("material", name if name in tables else tables[-1])
+    names = name, job.groups.get(name, name)
+    tables = [
+        written
+        for written, said in job.material.items()
+        if said.density is not None and (written in names or is_meant(written, name))
+    ]
+    return ("material", next((each for each in names if each in tables), tables[-1]))

@@ -48,7 +48,12 @@ def memory_budget(job: Job) -> MemoryBudget:
     free = free_gpu_bytes() if device == "cuda" else None
     if free is not None:
         return MemoryBudget(int(SHARE * free), "the GPU", on_gpu=True)
-    return MemoryBudget(int(SHARE * psutil.virtual_memory().available), "this machine")
+    return MemoryBudget(free_bytes(), "this machine")
+
+
+def free_bytes() -> int:
+    """Memory of this machine that a process may claim [bytes]."""
+    return int(SHARE * psutil.virtual_memory().available)
 
 
 class _NvmlMemory(ctypes.Structure):

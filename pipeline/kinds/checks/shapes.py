@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.model.amounts import count, gigabytes
 from pipeline.model.boxes import Box
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, suggestion
@@ -16,25 +18,44 @@ from sim.shapes.parameters import MeshShape, Placement
 OUT_OF_SCALE = 30.0
 """A mesh so many times larger than the scene is not meant: a cell of its grid of distances is a tenth of the scene."""
 
+TRIANGLE_BYTES = 300.0
+"""Memory of a triangle in Blender and Cycles, 294 as measured with a million."""
+
 if TYPE_CHECKING:
     from pipeline.kinds.base import Solids
     from sim.shapes.placement import PlacedSolid
 
 
-def build_solids(placements: Iterable[tuple[KeyPath, Placement]], findings: Findings) -> Solids:
-    """Every shape that can be built, by its path; notes what is wrong with the others."""
-    from sim.shapes.placement import build_solid
+def build_solids(
+    placements: Iterable[tuple[KeyPath, Placement]], findings: Findings, *, room_bytes: float = math.inf
+) -> Solids:
+    """Every shape that can be built, by its path; notes what is wrong with the others.
+
+    None is built any more once the meshes of files have more triangles than can be drawn in so much memory [bytes].
+    """
+    from sim.shapes.placement import SharedShapes, build_solid
     from sim.shapes.solid import ShapeError
 
     solids = {}
+    shapes, triangles, meshes = SharedShapes(), 0, 0
     for path, placement in placements:
         if not mesh_exists(placement.shape, path, findings):
             continue
         try:
-            solids[path] = build_solid(placement)
+            solids[path] = build_solid(placement, shapes)
         except ShapeError as error:
             findings.error((*path, "shape"), str(error))
             continue
+        if isinstance(placement.shape, MeshShape) and getattr(placement, "is_own_model", True):
+            triangles, meshes = triangles + len(solids[path].rest_mesh().faces), meshes + 1
+            if triangles * TRIANGLE_BYTES > room_bytes:
+                findings.error(
+                    (*path, "shape"),
+                    f"is more than can be drawn: the first {meshes:,} meshes have {count(triangles)} triangles, which "
+                    f"need {gigabytes(triangles * TRIANGLE_BYTES)}, and {gigabytes(room_bytes)} are free; give them "
+                    "fewer triangles, or make those of one file a group by count, which shares one mesh",
+                )
+                break
         for warning in solids[path].warnings:
             findings.warn((*path, "shape"), warning)
     return solids

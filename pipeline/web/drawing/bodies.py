@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.kinds.table import KINDS, material_of
+from pipeline.kinds.table import bodies as bodies_of
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, parts_of
 from pipeline.store.cache import read_frame, read_smoke_density
@@ -106,7 +108,11 @@ class Setting:
 
     def parameters(self, body: Body, name: str) -> Any:
         """What the job says of a body; None if it has no such body."""
-        return next((each for each in KINDS[body.kind].bodies(self.job) if each.name == name), None)
+        return self._by_name.get((body.kind, name))
+
+    @cached_property
+    def _by_name(self) -> dict[tuple[str, str], Any]:
+        return {(kind.name, body.name): body for _, kind, body in bodies_of(self.job)}
 
 
 @dataclass(frozen=True)
@@ -188,7 +194,7 @@ def _draw_parts(canvas: Canvas, name: str, pose: Pose, setting: Setting) -> None
     """All parts of a body whose meshes are there."""
     parameters = setting.parameters(pose, name)
     for part in () if parameters is None else parts_of(parameters.shape.type):
-        mesh = setting.mesh(name, part)
+        mesh = setting.mesh(parameters.model, part)
         if mesh is not None:
             color, path = color_of(setting.job, name, part, BODY_COLOR), f"/{pose.kind}/{name}/{part}"
             canvas.mesh(path, *mesh, color, position=pose.position, orientation=pose.orientation)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.job.overrides import Override
+from pipeline.kinds.base import Kind
 from pipeline.kinds.live_parameters import Parameter, Value
 from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
@@ -33,10 +34,18 @@ def set_parameter(world: World, job: Job, parameter: Parameter, value: Value, *,
         if kind.live is None or solver is None:
             continue
         if kind.name == path[0]:
-            kind.live.set(solver, kind.bodies(job)[int(path[1])].name, str(path[2]), value, before)
+            for body in _bodies_at(job, kind, int(path[1])):
+                kind.live.set(solver, body, str(path[2]), value, before)
         elif parameter.name == "gravity" and kind.live.set_gravity is not None:
             kind.live.set_gravity(solver, value)
     world.tell_couplings()
+
+
+def _bodies_at(job: Job, kind: Kind, table: int) -> list[str]:
+    """Names of the bodies that a table of the job makes."""
+    if kind is KINDS["rigid"]:
+        return [body.name for body in job.rigid if body.table == table]
+    return [kind.bodies(job)[table].name]
 
 
 def overrides_of(parameters: tuple[Parameter, ...], values: Mapping[str, Value]) -> list[Override]:

@@ -218,9 +218,9 @@ class _Recording:
             (("recorded",), self._name),
             ((length[0],), length[1]),
         ]
-        for number, (written, lived) in enumerate(zip(job.rigid, self._session.job.rigid, strict=True)):
-            if written.kind != lived.kind:
-                changes.append((("rigid", number, "kind"), lived.kind))
+        both = zip(job.rigid, self._session.job.rigid, strict=True)
+        led = {written.table: lived.kind for written, lived in both if written.kind != lived.kind}
+        changes += [(("rigid", table, "kind"), kind) for table, kind in led.items()]
         overrides = [Override(path, value, "live") for path, value in changes]
         return text_with_values(self._loaded, self._session.values, overrides)
 

@@ -33,11 +33,8 @@ def save_job(loaded: LoadedJob, values: Mapping[str, Value], folder: Path) -> tu
         OSError: it cannot be written.
     """
     led = bodies_led_before(loaded)
-    at_rest = [
-        Override(("rigid", number, "kind"), "static", "live")
-        for number, body in enumerate(loaded.job.rigid)
-        if led is not None and body.name in led
-    ]
+    tables = dict.fromkeys(body.table for body in loaded.job.rigid if led is not None and body.name in led)
+    at_rest = [Override(("rigid", table, "kind"), "static", "live") for table in tables]
     for path in numbered_paths(folder, f"{loaded.job.name}-live", ".toml"):
         text = text_with_values(loaded, values, [Override(("name",), path.stem, "live"), *at_rest])
         if loaded.job.recorded is not None:

@@ -55,7 +55,7 @@ class LiveScene:
         self._ball = icosphere(subdivisions=2, radius=PIN_SHARE * size)
         meshes: dict[tuple[str, str], Mesh] = {}
         for body in job.rigid:
-            meshes |= meshes_at_rest(body)
+            meshes |= meshes_at_rest(body) if body.is_own_model else {}
         look = Look(frozenset(kind.display.layer for kind in KINDS.values()))
         self._setting = Setting(job, lambda body, part: meshes[body, part], look)
 

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from pipeline.base.files import stamp_of
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
+from pipeline.kinds.rigid import meshes_at_rest
 from pipeline.kinds.table import points_of
 from pipeline.model.job import Job
-from pipeline.model.looks import parts_of
 from pipeline.store.receipts import Receipt, of_newest, read_receipt
 
 FileStamp = tuple[int, int, int]
@@ -99,7 +99,7 @@ class CommittedFrames:
 
 def artifacts_of_frame(job: Job, layout: JobLayout, frame: int | None) -> list[ArtifactPath]:
     """All files that a frame is shown from; None: those that belong to no frame."""
-    artifacts = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
+    artifacts = [*meshes_at_rest(job.rigid)]
     if frame is None:
         return artifacts
     artifacts.append(layout.frame_cache(frame))

@@ -89,15 +89,17 @@ class JobScene:
         built: dict[tuple[str, str], Mesh] = {}
         failed: list[str] = []
         for body in self._job.rigid:
+            if not body.is_own_model:
+                continue
             files = [self._layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
             try:
                 built |= {} if all(map(self._committed.is_there, files)) else meshes_at_rest(body)
             except (ValueError, OSError) as error:
-                failed.append(f"{body.name} is not shown: {error}")
+                failed.append(f"{body.group} is not shown: {error}")
         return built, failed
 
     def _mesh(self, body: str, part: str) -> Mesh | None:
-        """The mesh of a part of a body; None if it cannot be made or read."""
+        """The mesh of a part of a body that is its own; None if it cannot be made or read."""
         artifact = self._layout.body_mesh(body, part)
         stamp = self._committed.stamp([artifact])
         kept = self._meshes.get(artifact)

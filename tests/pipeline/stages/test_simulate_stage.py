@@ -65,6 +65,24 @@ keyframe = [{{ time_s = 0.0 }}, {{ time_s = 0.1, offset = [0.05, 0.0, 0.1] }}]
 """
 """Cloth, a body and contacts, coupled both ways."""
 
+RUBBLE = """
+name = "drop"
+frames = {frames}
+
+[[rigid]]
+name = "stone"
+kind = "dynamic"
+density = 2000.0
+shape = {{ type = "box", size = [0.1, 0.08, 0.06] }}
+count = 12
+scales = [0.6, 1.0]
+seed = 3
+position = [0.0, 0.0, 0.25]
+velocity = [0.0, 0.0, -2.0]
+scatter = {{ shape = {{ type = "box", size = [0.5, 0.5, 0.4] }} }}
+"""
+"""A group that falls to the floor, where contacts are followed from frame to frame."""
+
 PLUME = """
 name = "drop"
 frames = {frames}
@@ -127,6 +145,7 @@ def frames_of(layout: JobLayout, count: int) -> list[bytes]:
     [
         pytest.param("write_frame", JOB, id="frame"),
         pytest.param("write_checkpoint", JOB, id="checkpoint"),
+        pytest.param("write_checkpoint", RUBBLE, id="checkpoint of a group"),
         pytest.param("write_checkpoint", DRAPE, id="checkpoint of cloth", marks=pytest.mark.slow),
         pytest.param("write_frame", PLUME, id="frame of smoke", marks=pytest.mark.slow),
     ],
