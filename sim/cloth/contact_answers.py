@@ -7,6 +7,9 @@ from sim.core.arrays import Floats, LongIntegers, Vectors
 from sim.core.bundles import func
 from sim.core.warps import add_to, largest_in_warp
 
+Given = ti.types.vector(6, ti.i64)
+"""What a body gets of contacts, in their units: impulse and moment."""
+
 
 @func
 def relative_displacement(c: ti.i32, contacts: Contacts, displacement: Vectors, body_motion: Vectors) -> ti.math.vec3:
@@ -45,10 +48,25 @@ def body_mobility(arm: ti.math.vec3, inverse_mass: ti.f32, inverse_inertia: ti.m
 @ti.func
 def give_body(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers):
     """Add the opposite of an impulse, in units, to what a body gets, to the nearest unit."""
+    give(opposite_of(push, arm), body, body_gathered)
+
+
+@ti.func
+def opposite_of(push: ti.math.vec3, arm: ti.math.vec3) -> Given:
+    """The opposite of an impulse, in units, and of its moment, to the nearest unit."""
     twist = arm.cross(push)
+    given = Given(0)
     for axis in ti.static(range(3)):
-        ti.atomic_add(body_gathered[6 * body + axis], -ti.round(push[axis], ti.i64))
-        ti.atomic_add(body_gathered[6 * body + 3 + axis], -ti.round(twist[axis], ti.i64))
+        given[axis], given[3 + axis] = -ti.round(push[axis], ti.i64), -ti.round(twist[axis], ti.i64)
+    return given
+
+
+@ti.func
+def give(given: Given, body: ti.i32, body_gathered: LongIntegers):
+    """Add what a body gets; of body -1 nothing."""
+    if body >= 0:
+        for axis in ti.static(range(6)):
+            ti.atomic_add(body_gathered[6 * body + axis], given[axis])
 
 
 @ti.func

@@ -3,16 +3,20 @@
 import taichi as ti
 
 from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, PushedNodes
-from sim.cloth.contact_answers import answered, body_mobility, give_body_together
+from sim.cloth.contact_answers import Given, answered, body_mobility, give, give_body_together, opposite_of
 from sim.cloth.contact_supports import SHARES_PER_UNIT, answer_of, hold, support_between, turned_to_support
 from sim.cloth.proximity_contacts import INACTIVE, WALL
 from sim.core.bundles import func
 from sim.core.launch import large_kernel
+from sim.core.reductions import runs_on_gpu
 from sim.core.warps import whole_warps
 
 LEAST_FREE_WEIGHT = 0.05
 """A contact pushes only if its vertices that no pin holds have so much of its weight, so that none moves more than
 twenty times what the contact lacks. Others are only watched: a corner far from a contact of two pins is no lever."""
+
+AT_A_TIME = 64
+"""Contacts whose impulses on a body a thread of a CPU sums up by itself."""
 
 ALONE = -1
 """In the place of the first use of a vertex: what stands touches it, and nothing else does."""
@@ -98,21 +102,34 @@ def weigh_contacts(
                 of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
                 own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
                 nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
-    for c in range(weighed_end):
-        push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
-        if c < contacts_end and impulses.mobility[c] > 0.0:
-            if is_first == 1:
-                impulses.impulse[c] = ti.math.vec3(0.0)
-            v = contacts.vertices[c][0]
-            if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
-                impulses.mobility[c] = nodes.inverse_mass[v]
-                push, body, arm = settle(c, contacts, impulses, nodes, bodies), contacts.kind[c], contacts.arm[c]
-                sums.counter[4] = 1
-            else:
-                place = ti.atomic_add(sums.counter[0], 1)
-                impulses.pushing[place] = c
-                impulses.mobility[c] = weighed(c, place, contacts, impulses, nodes, sums, bodies)
-        give_body_together(push, body, arm, bodies.impulse, c)
+    for first in range(weighed_end):
+        # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
+        if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
+            continue
+        given_body, given = -1, Given(0)
+        for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
+            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
+            if c < contacts_end and impulses.mobility[c] > 0.0:
+                if is_first == 1:
+                    impulses.impulse[c] = ti.math.vec3(0.0)
+                v = contacts.vertices[c][0]
+                if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
+                    impulses.mobility[c] = nodes.inverse_mass[v]
+                    push, body, arm = settle(c, contacts, impulses, nodes, bodies), contacts.kind[c], contacts.arm[c]
+                    if sums.counter[4] == 0:
+                        sums.counter[4] = 1
+                else:
+                    place = ti.atomic_add(sums.counter[0], 1)
+                    impulses.pushing[place] = c
+                    impulses.mobility[c] = weighed(c, place, contacts, impulses, nodes, sums, bodies)
+            if ti.static(runs_on_gpu()):
+                give_body_together(push, body, arm, bodies.impulse, c)
+            elif body >= 0:
+                if body != given_body:
+                    give(given, given_body, bodies.impulse)
+                    given_body, given = body, Given(0)
+                given += opposite_of(push, arm)
+        give(given, given_body, bodies.impulse)
 
 
 @func

@@ -339,7 +339,7 @@ def touch_body(
         turned = bodies.rotation[b]
         y = turned.transpose() @ r + bodies.centre_of_mass[b]
         distance = distance_to(y, b, bodies.shapes)
-        if distance < 0.0 and half > 0.0:
+        if half > 0.0 and -0.5 * distance / half > bodies.depth[b]:
             ti.atomic_max(bodies.depth[b], -0.5 * distance / half)
         if distance < keeps + relative.norm():
             gradient = ti.math.vec3(0.0)

@@ -17,6 +17,7 @@ import taichi as ti
 from sim.cloth.bundles import Lines, Nodes
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
+from sim.core.scheduling import LEAST_RUN
 
 LANES = 8
 """Numbers of a block: what a vector unit of 256 bits holds. Twice as many are not faster, and take thrice as long to
@@ -134,7 +135,10 @@ def load_blocks(blocks: ti.template(), nodes: Nodes, along: Lines):
 
     Turned ones get their displacements by `turn`.
     """
-    for strip in range(along.strips):
+    for place in range(along.strips * LEAST_RUN):
+        if place % LEAST_RUN != 0:
+            continue
+        strip = place // LEAST_RUN
         for k in range(along.other_strips * LANES):
             u, lattice, weight = VectorBlock(0.0), LatticeBlock(0), Block(0.0)
             if k < along.length:
@@ -153,9 +157,9 @@ def load_blocks(blocks: ti.template(), nodes: Nodes, along: Lines):
 @kernel
 def store_blocks(blocks: ti.template(), nodes: Nodes, along: Lines):
     """Write the displacements of the upright blocks to the nodes of the cloth."""
-    for k in range(along.length):
-        for strip in range(along.strips):
-            u = blocks.u[k * along.strips + strip]
-            for at in range(ti.min(LANES, along.count - strip * LANES)):
-                i = along.first_node + (strip * LANES + at) * along.line_step + k * along.node_step
-                nodes.displacement[i] = lane(u, at)
+    for block in range(along.length * along.strips):
+        k, strip = block // along.strips, block % along.strips
+        u = blocks.u[block]
+        for at in range(ti.min(LANES, along.count - strip * LANES)):
+            i = along.first_node + (strip * LANES + at) * along.line_step + k * along.node_step
+            nodes.displacement[i] = lane(u, at)

@@ -14,6 +14,7 @@ from sim.cloth.threads import direction_of, tension_to_turn
 from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import large_kernel
+from sim.core.scheduling import LEAST_RUN
 
 BEND_COLOURS = 3
 """Bend springs along a line that share no node: every third one."""
@@ -32,7 +33,10 @@ def bend_lines(
 
     `stiffness` is of the springs of each line [N/m], (strips * LANES,), `gamma` their damping over stiffness and dt.
     """
-    for strip in range(along.strips):
+    for place in range(along.strips * LEAST_RUN):
+        if place % LEAST_RUN != 0:
+            continue
+        strip = place // LEAST_RUN
         turn(blocks.u, strip, along)
         strength = Block(0.0)
         for at in range(LANES):
@@ -112,7 +116,10 @@ def solve_cells_in_rows(
     In each row every second cell first, then those between, which share nodes with them: all are computed alike, eight
     at a time, and every second one acts. `steps` are the lengths of a cell [m], `stiffness` is G times its area [J].
     """
-    for pair in range((along.length - parity) // 2):
+    for place in range((along.length - parity) // 2 * LEAST_RUN):
+        if place % LEAST_RUN != 0:
+            continue
+        pair = place // LEAST_RUN
         lower = (2 * pair + parity) * along.strips
         strength = stiffness * dt_squared
         half = ti.sqrt(0.5)
@@ -164,7 +171,10 @@ def measure_lines(blocks: ti.template(), along: Lines, rest: ti.f32, quantum: ti
     """Strains at the nodes of all lines along one direction, of the two springs there or the one, for the lines across:
     in blocks of these.
     """
-    for strip in range(along.strips):
+    for place in range(along.strips * LEAST_RUN):
+        if place % LEAST_RUN != 0:
+            continue
+        strip = place // LEAST_RUN
         turn(blocks.u, strip, along)
         before = Block(0.0)
         for k in range(along.length):
@@ -202,7 +212,10 @@ def solve_lines(
     each node start at 0 if `is_first`; `across` are the strains at nodes along the other direction, if `poisson` is not
     0.
     """
-    for strip in range(along.strips):
+    for place in range(along.strips * LEAST_RUN):
+        if place % LEAST_RUN != 0:
+            continue
+        strip = place // LEAST_RUN
         turn(blocks.u, strip, along)
         compliance = Block(0.0)
         for at in range(LANES):
@@ -261,7 +274,10 @@ def solve_lines(
 @large_kernel
 def straighten_lines(blocks: ti.template(), along: Lines):
     """Let tension turn with the threads along one direction, in strips with too much of it."""
-    for strip in range(along.strips):
+    for place in range(along.strips * LEAST_RUN):
+        if place % LEAST_RUN != 0:
+            continue
+        strip = place // LEAST_RUN
         if blocks.is_taut[along.first + strip]:
             turn(blocks.u, strip, along)
             turn(blocks.predicted, strip, along)

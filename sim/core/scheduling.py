@@ -13,6 +13,9 @@ instead, enough for every thread to have one, and every worker takes the next fe
 
 with `workers` from `workers_for(count)`. On a GPU each worker has the item of its own number. Which thread has an item
 differs from run to run; so what is done for an item may depend on no other.
+
+Where few items are alike in work, a CPU's loop may have `LEAST_RUN` places for each, of which the first does it; so
+threads get single ones.
 """
 
 import taichi as ti

@@ -79,7 +79,7 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
     for contacts in solver.contacts:
         contacts.resolve(state, dt, lambda: lambda: False)
     allowed = state.displacement.to_numpy().astype(np.float64)
-    finish_step(state.nodes, state.motion, state.position, state.limit, dt, solver._no_reasons, False)
+    finish_step(state.nodes, state.motion, state.position, state.limit, dt, solver._no_reasons)
     return allowed
 
 
