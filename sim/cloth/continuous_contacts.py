@@ -238,7 +238,10 @@ class ContinuousContacts:
             if not is_ahead and not self._has_bounds():
                 return -1, None
             self._pairs.find(state, self._contacts, recovery, is_ahead=is_ahead)
-            asked = self.rigid.find(state, self._patches, self._pairs.motion, self._contacts, recovery)
+            met = self._pairs.patch_pairs
+            asked = self.rigid.find(
+                state, self._patches, met.bounds.motion, met.budget.margin, self._contacts, recovery
+            )
             if is_ahead:
                 begun = self._begin_push(state, is_first=True, short=False), relax()
                 if not self._has_bounds():

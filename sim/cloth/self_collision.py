@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, PatchMotion, Rest
+from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, Rest
 from sim.cloth.element_blocks import ElementBlocks
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.near_pairs import find_near_pairs
@@ -202,11 +202,6 @@ class SelfCollision:
         """
         lists = (self.with_triangles, self.of_edges)
         return True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
-
-    @property
-    def motion(self) -> PatchMotion:
-        """Of the patches in the substep."""
-        return self._met.bounds.motion
 
     @property
     def patches(self) -> Patches:
