@@ -27,6 +27,7 @@ from sim.cloth.bundles import (
 )
 from sim.cloth.contact_end import end_contacts
 from sim.cloth.loop_costs import NODE_NS
+from sim.cloth.near_pairs import NEVER, carry_pieces, keep_pairs
 from sim.cloth.patch_motion_kernels import (
     LARGEST_STILL,
     look_at_patches,
@@ -36,7 +37,6 @@ from sim.cloth.patch_motion_kernels import (
     sort_known,
 )
 from sim.cloth.patches import Patches
-from sim.cloth.self_collision_kernels import NEVER, carry_pieces
 from sim.core.bundles import with_room
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import is_short, workers_for
@@ -123,15 +123,10 @@ class PairList:
         return True
 
     def resize(self, capacity: int) -> None:
-        """Have so many places."""
-        kept, listed = min(self.capacity, capacity), self.on_device[OF_PIECES:]
-        self.capacity = capacity
-        room = _room_for_pairs(capacity)
-        for source, target in zip(listed, room, strict=True):
-            values = target.to_numpy()
-            values[:kept] = source.to_numpy()[:kept]
-            target.from_numpy(values)
-        self.on_device = PairPieces(*self.on_device[:OF_PIECES], *room)
+        """Have so many places, with what they hold."""
+        kept, before = min(self.capacity, capacity), self.on_device
+        self.capacity, self.on_device = capacity, PairPieces(*before[:OF_PIECES], *_room_for_pairs(capacity))
+        keep_pairs(kept, before, self.on_device)
 
 
 OF_PIECES = 3

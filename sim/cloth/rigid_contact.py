@@ -20,12 +20,12 @@ from sim.cloth.bundles import (
     Weights,
 )
 from sim.cloth.loop_costs import NODE_NS
+from sim.cloth.near_pairs import lanes_of_pair
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision import Box
-from sim.cloth.self_collision_kernels import lanes_of_pair
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func

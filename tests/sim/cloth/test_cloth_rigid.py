@@ -528,7 +528,7 @@ def test_cloth_is_not_pushed_by_what_it_only_passes():
     body = geometry(BALL)
     contact = RigidContact([body], [0.5], ())
     contact.place(Poses(np.array([[0.0, 0.0, 0.0517]]), np.eye(3)[None]))
-    solver.add_contacts(ContinuousContacts(solver.state, rigid=contact))
+    solver.contacts = ContinuousContacts(solver.state, rigid=contact)
     sideways = np.zeros((25, 3))
     sideways[:, 0] = 5e-4
     np.testing.assert_array_equal(displace(solver, sideways), sideways.astype(np.float32))
