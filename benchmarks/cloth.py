@@ -1,13 +1,16 @@
-"""Speed of cloth that falls over a ball; JSON on the standard output.
+"""Speed of cloth that falls over a ball, or slides into a funnel and heaps up; JSON on the standard output.
 
     python -m benchmarks.cloth --nodes 128 --substeps 20 --device cpu [--without-contacts] [--blender]
+    python -m benchmarks.cloth --scene funnel --nodes 256 --frames 90 --device cuda [--by-kernel]
 
-A square metre of cloth falls flat onto a ball, drapes itself around it and reaches the floor. Times are of whole frames
-at 60 frames a second, contacts with the ball, the floor and itself included; of the frames the median counts. The
-processor time of all threads stands beside it, as other programs on the same cores do not enter it (on a GPU it says
-nothing). Parts of a substep are timed apart, at the end, where the cloth is folded most; contacts in one more frame, as
-lists last only while cloth moves as it does in a run. With `--blender` Blender's own
-cloth (bpy of this Python) does the same drop of the same mesh; both results are described by the same numbers.
+A square metre of cloth falls flat onto a ball, drapes itself around it and reaches the floor; the funnel is that of
+`validation.cases.cloth_crossings`. Times are of whole frames at 60 frames a second, contacts with the ball, the floor
+and itself included; the median and the most of those from `--from-frame` on count, whose substeps, contacts and listed
+pairs of elements stand beside them. The processor time of all threads is told, too, as other programs on the same cores
+do not enter it (on a GPU it says nothing). Parts of a substep are timed apart, at the end, where the cloth is folded
+most; contacts in one more frame, as lists last only while cloth moves as it does in a run. With `--by-kernel` a GPU's
+own time of each kernel in the last frames is told. With `--blender` Blender's own cloth (bpy of this Python) does the
+same drop of the same mesh; both results are described by the same numbers.
 """
 
 from __future__ import annotations
@@ -21,11 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.compare import arguments_of, child, machine, run, spread, start_taichi, timed
+from benchmarks.launches import DeviceTimes
 from sim.scene import SceneParameters
+from validation.cases.cloth_crossings import in_a_funnel
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
-    from sim.core.world import World
+    from sim.core.world import FrameReport, World
 
 SIDE, HEIGHT = 1.0, 0.3
 """Length of the cloth's sides, and how high it starts [m]."""
@@ -37,6 +42,20 @@ THICKNESS_IN_SPACINGS = 0.5
 """Distance that layers keep: below the spacing of nodes, as a cloth that folds needs."""
 
 FRAMES_PER_SECOND = 60.0
+
+
+BY_KERNEL_FRAMES = 2
+"""Frames in which a GPU's time of each kernel is taken."""
+
+
+def funnel(nodes: int, *, substeps: int) -> SceneParameters:
+    """The funnel, for a sheet of nodes x nodes that is thick as that of the drop."""
+    document = in_a_funnel(nodes)
+    (cloth,) = document["cloth"]
+    thickness = THICKNESS_IN_SPACINGS * cloth["shape"]["size"][0] / (nodes - 1)
+    return SceneParameters.model_validate(
+        {**document, "cloth": [{**cloth, "substeps": substeps, "thickness": thickness}]}
+    )
 
 
 def scene(nodes: int, *, substeps: int, self_collision: bool, mass_per_area: float) -> SceneParameters:
@@ -63,38 +82,53 @@ def scene(nodes: int, *, substeps: int, self_collision: bool, mass_per_area: flo
 
 
 def measure(nodes: int, arguments: argparse.Namespace) -> dict[str, Any]:
-    """One drop: times of frames and of the parts of a substep, and what became of the cloth."""
+    """One fall: times of frames and of the parts of a substep, and what became of the cloth."""
     import taichi as ti
 
     from sim.build import build_world
     from sim.cloth.solver import ClothSolver
 
-    parameters = scene(
-        nodes, substeps=arguments.substeps, self_collision=not arguments.without_contacts, mass_per_area=0.3
-    )
+    if arguments.scene == "funnel":
+        parameters = funnel(nodes, substeps=arguments.substeps)
+    else:
+        parameters = scene(
+            nodes, substeps=arguments.substeps, self_collision=not arguments.without_contacts, mass_per_area=0.3
+        )
     start = time.perf_counter()
     world = build_world(parameters, frames_per_second=FRAMES_PER_SECOND)
     solver = next(each for each in world._solvers.values() if isinstance(each, ClothSolver))
     if arguments.without_contacts:
-        solver.contacts.clear()
+        solver.contacts = None
     built_s = time.perf_counter() - start
-    substeps = 0
+    times: list[tuple[float, float]] = []
+    counted: dict[str, list[float]] = {"substeps": [], "contacts": [], "listed_pairs": []}
+    device = DeviceTimes() if arguments.by_kernel else None
+    for number in range(1, arguments.frames + 1):
+        if device is not None and number > arguments.frames - BY_KERNEL_FRAMES:
+            device.watch()  # it slows the frames down that it watches
+        reports: list[FrameReport] = []
 
-    def frame() -> None:
-        nonlocal substeps
-        substeps = world.advance_frame().substeps[solver.name]
-        ti.sync()
+        def frame(reports: list[FrameReport] = reports) -> None:
+            reports.append(world.advance_frame())
+            ti.sync()
 
-    times = [timed(frame) for _ in range(arguments.frames)]
+        times.append(timed(frame))
+        (report,) = reports
+        counted["substeps"].append(report.substeps[solver.name])
+        counted["contacts"].append(report.diagnostics[solver.name].get("contacts", 0.0))
+        counted["listed_pairs"].append(listed_pairs(solver))
+    first = min(arguments.from_frame, arguments.frames) - 1
     dt = solver.stable_dt()
     integrator: Any = solver._integrator
     return {
         "nodes": nodes,
         "springs": sum(springs.count for springs in solver._springs),
         "triangles": solver.state.triangle_count,
-        "substeps_of_last_frame": substeps,
         "building_s": built_s,
-        **frame_times(times),
+        **frame_times(times, first),
+        **{name: spread(numbers[first:]) for name, numbers in counted.items()},
+        "by_frame": {"wall": [1e3 * wall for wall, _ in times], **counted},
+        "device_ms_a_frame": device and device.per_frame(BY_KERNEL_FRAMES),
         "substep_parts_ms": {
             name: 1e3 * fastest(part, arguments.repeats)
             for name, part in {
@@ -104,30 +138,40 @@ def measure(nodes: int, arguments: argparse.Namespace) -> dict[str, Any]:
             }.items()
         },
         "diagnostics": dict(solver.diagnostics()),
-        "result": described(solver.state.positions(), solver.state.host.triangles),
+        "result": described(solver.state.positions(), solver.state.host.triangles, has_ball=arguments.scene == "ball"),
         "contacts_ms_a_substep_of_one_more_frame": 1e3 * seconds_of_contacts(world, solver),
     }
+
+
+def listed_pairs(solver: ClothSolver) -> int:
+    """Pairs of elements of cloth that are near enough to be watched."""
+    from sim.core.host_access import copied
+
+    if solver.contacts is None:
+        return 0
+    pairs = solver.contacts._pairs
+    lists, count = (pairs.with_triangles, pairs.of_edges), pairs.patch_pairs.count
+    return sum(int(copied(each.on_device.pieces)[:count, 2].sum()) for each in lists)
 
 
 def seconds_of_contacts(world: World, solver: ClothSolver) -> float:
     """Mean time of the contacts in a substep of the next frame [s]."""
     import taichi as ti
 
-    spent, resolvers = [0.0], [contacts.resolve for contacts in solver.contacts]
+    contacts, spent = solver.contacts, [0.0]
+    if contacts is None:
+        return 0.0
+    resolve = contacts.resolve
 
-    def timed(resolve: Callable[..., bool]) -> Callable[..., bool]:
-        def resolve_timed(*arguments: Any) -> bool:
-            ti.sync()
-            start = time.perf_counter()
-            is_concluded = resolve(*arguments)
-            ti.sync()
-            spent[0] += time.perf_counter() - start
-            return is_concluded
+    def resolve_timed(*arguments: Any) -> bool:
+        ti.sync()
+        start = time.perf_counter()
+        is_concluded = resolve(*arguments)
+        ti.sync()
+        spent[0] += time.perf_counter() - start
+        return is_concluded
 
-        return resolve_timed
-
-    for contacts, resolve in zip(solver.contacts, resolvers, strict=True):
-        contacts.resolve = timed(resolve)
+    contacts.resolve = resolve_timed
     solver.state.place_displaced()  # as the parts that were timed left other displacements
     substeps = world.advance_frame().substeps[solver.name]
     return spent[0] / substeps
@@ -145,7 +189,9 @@ def fastest(part: Callable[[], object], repeats: int) -> float:
     return min(timed(whole)[0] for _ in range(repeats))
 
 
-def described(positions: NDArray[np.float64], triangles: NDArray[np.integer]) -> dict[str, Any]:
+def described(
+    positions: NDArray[np.float64], triangles: NDArray[np.integer], *, has_ball: bool = True
+) -> dict[str, Any]:
     """Where a cloth lies [m], and whether it crosses itself."""
     from sim.cloth.springs import edges_of
     from sim.cloth.start import first_crossing
@@ -157,22 +203,22 @@ def described(positions: NDArray[np.float64], triangles: NDArray[np.integer]) ->
         "mean_height": float(positions[:, 2].mean()),
         "lowest": float(positions[:, 2].min()),
         "half_width": float(np.abs(positions[:, :2]).max()),
-        "deepest_in_ball": float(max(-ball.min(), 0.0)),
+        **({"deepest_in_ball": float(max(-ball.min(), 0.0))} if has_ball else {}),
         "crosses_itself": crossing is not None,
     }
 
 
-def frame_times(times: list[tuple[float, float]]) -> dict[str, dict[str, float]]:
-    """Wall and processor times of frames [ms], after the first ones, which compile."""
-    wall, processor = zip(*times[min(5, len(times) - 1) :], strict=True)
+def frame_times(times: list[tuple[float, float]], first: int) -> dict[str, dict[str, float]]:
+    """Wall and processor times of frames [ms], without so many at the start."""
+    wall, processor = zip(*times[first:], strict=True)
     return {"frame_ms": spread(wall, scale=1e3), "frame_processor_ms": spread(processor, scale=1e3)}
 
 
-def measure_blender(nodes: int, frames: int) -> dict[str, Any]:
-    """Blender's cloth, in a process of its own."""
+def measure_blender(nodes: int, frames: int, first: int) -> dict[str, Any]:
+    """Blender's cloth, in a process of its own; frames count after so many."""
     answer = child(["-m", "benchmarks.cloth", "--as-blender", "--nodes", str(nodes), "--frames", str(frames)])
     positions, triangles = np.array(answer.pop("positions")), np.array(answer.pop("triangles"))
-    return {**answer, **frame_times(answer.pop("times")), "result": described(positions, triangles)}
+    return {**answer, **frame_times(answer.pop("times"), first), "result": described(positions, triangles)}
 
 
 def drop_in_blender(nodes: int, frames: int) -> dict[str, Any]:
@@ -229,9 +275,14 @@ def drop_in_blender(nodes: int, frames: int) -> dict[str, Any]:
 
 def main() -> dict[str, Any]:
     parser = arguments_of(__doc__)
-    parser.add_argument("--nodes", type=int, nargs="+", default=[100], help="along each side, one drop each")
+    parser.add_argument("--scene", choices=("ball", "funnel"), default="ball")
+    parser.add_argument("--nodes", type=int, nargs="+", default=[100], help="along each side, one fall each")
     parser.add_argument("--substeps", type=int, default=20)
     parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument(
+        "--from-frame", type=int, default=15, help="counted from 1; until then kernels compile and cloth falls"
+    )
+    parser.add_argument("--by-kernel", action="store_true", help="the time of a GPU in the last frames")
     parser.add_argument("--repeats", type=int, default=20, help="of each part of a substep")
     parser.add_argument("--without-contacts", action="store_true", help="springs and air alone")
     parser.add_argument("--blender", action="store_true", help="also Blender's own cloth")
@@ -244,7 +295,7 @@ def main() -> dict[str, Any]:
     for nodes in arguments.nodes:
         drop = measure(nodes, arguments)
         if arguments.blender:
-            drop["blender"] = measure_blender(nodes, arguments.frames)
+            drop["blender"] = measure_blender(nodes, arguments.frames, min(arguments.from_frame, arguments.frames) - 1)
             for time_of in ("frame_ms", "frame_processor_ms"):
                 drop[f"blender_over_own_{time_of}"] = drop["blender"][time_of]["median"] / drop[time_of]["median"]
         runs.append(drop)

@@ -6,6 +6,7 @@ Kernels that return something wait for the device, so that their time is that of
 with its kernel; on a GPU its time is what the host needs to hand it over, of which small scenes are made.
 """
 
+import ctypes
 import statistics
 import time
 from collections import defaultdict
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.compare import arguments_of, machine, run, start_taichi
-from pipeline.job.loading import load_job
+from sim.core.cuda_driver import ask
 
 
 class Counter:
@@ -42,9 +43,61 @@ class Counter:
     def per_frame(self, frames: int) -> dict[str, dict[str, float]]:
         """Number, and time of the host [ms], of each name in a frame, by time; the sums of all first."""
         rows = {name: (len(spent) / frames, 1e3 * sum(spent) / frames) for name, spent in self._spent.items()}
-        rows = dict(sorted(rows.items(), key=lambda row: -row[1][1]))
-        rows = {"all": (sum(n for n, _ in rows.values()), sum(ms for _, ms in rows.values())), **rows}
-        return {name: {"a_frame": number, "host_ms": ms} for name, (number, ms) in rows.items()}
+        return table_of(rows, "host_ms")
+
+
+class DeviceTimes:
+    """Takes the time of a CUDA device for each launch, with the gap before it where the device had nothing to do."""
+
+    def __init__(self) -> None:
+        self._events: dict[str, list[tuple[ctypes.c_void_p, ctypes.c_void_p]]] = defaultdict(list)
+        self._is_watching = False
+
+    def watch(self) -> None:
+        """From now on, if not yet; each launch takes the host some microseconds more."""
+        from sim.core.launch import FastKernel
+
+        if self._is_watching:
+            return
+        self._is_watching, launch = True, FastKernel._launch
+
+        def watched(kernel: Any, *arguments: Any) -> Any:
+            before = _event()
+            context = launch(kernel, *arguments)
+            self._events[kernel.__name__].append((before, _event()))
+            return context
+
+        FastKernel._launch = watched
+
+    def per_frame(self, frames: int) -> dict[str, dict[str, float]]:
+        """Number of launches, and time of the device [ms], of each kernel in a frame, by time; the sums of all first.
+
+        Call after the device has done everything.
+        """
+        rows = {}
+        for name, events in self._events.items():
+            total = 0.0
+            for before, after in events:
+                took = ctypes.c_float()
+                ask("cuEventElapsedTime", ctypes.byref(took), before, after)
+                total += took.value
+            rows[name] = (len(events) / frames, total / frames)
+        return table_of(rows, "device_ms")
+
+
+def _event() -> ctypes.c_void_p:
+    """An event of the device behind all that was launched."""
+    event = ctypes.c_void_p()
+    ask("cuEventCreate", ctypes.byref(event), ctypes.c_uint(0))
+    ask("cuEventRecord", event, None)
+    return event
+
+
+def table_of(rows: dict[str, tuple[float, float]], kind: str) -> dict[str, dict[str, float]]:
+    """Number and time [ms] of each name in a frame, by time; the sums of all first."""
+    rows = dict(sorted(rows.items(), key=lambda row: -row[1][1]))
+    rows = {"all": (sum(n for n, _ in rows.values()), sum(ms for _, ms in rows.values())), **rows}
+    return {name: {"a_frame": number, kind: ms} for name, (number, ms) in rows.items()}
 
 
 def main() -> dict[str, Any]:
@@ -53,6 +106,7 @@ def main() -> dict[str, Any]:
     parser.add_argument("--after", type=int, default=5, help="frames that are not counted, for kernels to compile")
     parser.add_argument("--frames", type=int, default=5)
     arguments = start_taichi(parser)
+    from pipeline.job.loading import load_job
     from sim.build import build_world
     from sim.core import host_access
     from sim.core.launch import FastKernel

@@ -78,7 +78,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
         contacts = contacts_of_cloths(cloth, scene.rigid, domain=scene.domain, rigid=rigid)
-        cloth.add_contacts(contacts)
+        cloth.contacts = contacts
         couplings += [] if rigid is None else [ClothRigidCoupling(cloth, rigid, contacts)]
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)

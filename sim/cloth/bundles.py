@@ -474,7 +474,7 @@ class PushedNodes(NamedTuple):
     reached: Vectors  # displacement without momentum [m], (n,)
     touched: Integers  # numbers of those that contacts push
     uses: Integers  # first and last place of each node in `Impulses.used_by`, (2 n,)
-    support: Vectors  # see `contact_supports`, (n,)
+    support: Vectors  # see `contact_response`, (n,)
 
 
 @bundle

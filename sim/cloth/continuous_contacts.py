@@ -15,9 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import NodeSums, PushedNodes
-from sim.cloth.contact_iteration import STEPS
-from sim.cloth.contact_weights import weigh_contacts
-from sim.cloth.continuous_response import push
+from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
@@ -53,7 +51,7 @@ steps are; 64 bits hold the sum of ten million vertices stopped from 100 m/s in 
 
 
 class ContinuousContacts:
-    """Contacts of all cloths of a scene; implements `sim.cloth.solver.ClothContacts`.
+    """Contacts of all cloths of a scene, with themselves, each other, bodies and walls.
 
     A substep: the pairs of elements that may meet, and what may meet bodies and walls; displacements that keep all of
     them apart by their thickness, with friction; a test that no pair may have crossed on the way. Where it fails, the
@@ -181,7 +179,17 @@ class ContinuousContacts:
         relax: Callable[[], Callable[[], bool]],
         conclude: Callable[[ti.Ndarray], None] | None = None,
     ) -> bool:
-        """Change the displacements of a substep of dt [s] so that nothing crosses; see `ClothContacts`."""
+        """Change the displacements of a substep of dt [s], after the springs have, so that nothing crosses; pinned
+        nodes stay as they are. Returns whether the step was concluded.
+
+        Args:
+            state: with displacements.
+            dt: [s].
+            relax: asks how long springs are. The answer lets them change displacements once more where contacts
+                stretched them too much, and says whether it did; contacts are resolved again then.
+            conclude: has the device finish the step if three numbers there are 0, as they are where nothing remains to
+                be done: a GPU would wait while the host reads them.
+        """
         self._conclude = conclude
         self._pairs.look(state)
         self.rigid.begin_substep(dt)
@@ -232,7 +240,10 @@ class ContinuousContacts:
             if not is_ahead and not self._has_bounds():
                 return -1, None
             self._pairs.find(state, self._contacts, recovery, is_ahead=is_ahead)
-            asked = self.rigid.find(state, self._patches, self._pairs.motion, self._contacts, recovery)
+            met = self._pairs.patch_pairs
+            asked = self.rigid.find(
+                state, self._patches, met.bounds.motion, met.budget.margin, self._contacts, recovery
+            )
             if is_ahead:
                 begun = self._begin_push(state, is_first=True), relax()
                 if not self._has_bounds():

@@ -16,8 +16,8 @@ from sim.cloth.bundles import (
     SubstepEnd,
     TrackedNodes,
 )
-from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.cloth.near_pairs import NEVER, SAFETY_OF_DUE
+from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Share, is_finite, reduced_tree, runs_on_gpu
@@ -369,13 +369,10 @@ def age_pair(
 @func
 def measure_change(
     m: ti.i32,
-    corners: PatchNodes,
+    patches: MovingPatches,
     displacement: Vectors,
     predicted: Vectors,
     half_thickness: ti.f32,
-    change: Floats,
-    margin: Floats,
-    more: Floats,
     counter: Integers,
 ):
     """How far contacts displaced the vertices of a patch at most, `change` [m]; where that is beyond the `margin` that
@@ -383,14 +380,15 @@ def measure_change(
 
     The second number of `counter` becomes 1 where it is beyond, and the third where it is not finite.
     """
+    corners, budget = ti.static((patches.corners, patches.budget))
     squared = 0.0
     for place in range(corners.first[m], corners.first[m + 1]):
         i = corners.nodes[place]
         squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
-    change[m] = ti.sqrt(squared)
-    if change[m] > margin[m]:
-        margin[m] = 1.5 * change[m]
-        more[m] = margin[m] - half_thickness
+    budget.change[m] = ti.sqrt(squared)
+    if budget.change[m] > budget.margin[m]:
+        budget.margin[m] = 1.5 * budget.change[m]
+        budget.more[m] = budget.margin[m] - half_thickness
         counter[1] = 1
     if is_finite(squared) == 0:
         counter[2] = 1

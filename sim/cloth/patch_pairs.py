@@ -26,6 +26,7 @@ from sim.cloth.bundles import (
     Two,
 )
 from sim.cloth.contact_end import end_contacts
+from sim.cloth.near_pairs import NEVER, carry_pieces, keep_pairs
 from sim.cloth.patch_motion_kernels import (
     LARGEST_STILL,
     look_at_patches,
@@ -35,7 +36,6 @@ from sim.cloth.patch_motion_kernels import (
     sort_known,
 )
 from sim.cloth.patches import Patches
-from sim.cloth.self_collision_kernels import NEVER, carry_pieces
 from sim.core.bundles import with_room
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import workers_for
@@ -122,15 +122,10 @@ class PairList:
         return True
 
     def resize(self, capacity: int) -> None:
-        """Have so many places."""
-        kept, listed = min(self.capacity, capacity), self.on_device[OF_PIECES:]
-        self.capacity = capacity
-        room = _room_for_pairs(capacity)
-        for source, target in zip(listed, room, strict=True):
-            values = target.to_numpy()
-            values[:kept] = source.to_numpy()[:kept]
-            target.from_numpy(values)
-        self.on_device = PairPieces(*self.on_device[:OF_PIECES], *room)
+        """Have so many places, with what they hold."""
+        kept, before = min(self.capacity, capacity), self.on_device
+        self.capacity, self.on_device = capacity, PairPieces(*before[:OF_PIECES], *_room_for_pairs(capacity))
+        keep_pairs(kept, before, self.on_device)
 
 
 OF_PIECES = 3
@@ -157,6 +152,7 @@ class PatchPairs:
         count: how many there are.
         capacity: room for so many.
         bounds: boxes around patches at the last `look`, and the rigid motion of each in the substep.
+        budget: how far they move, and may be displaced by contacts.
         carried: numbers that pairs had before the last `meet`, or -1, (count,).
         counters: of `look_at_patches` and `end_contacts`.
         expired_count, due_count: how many pairs have to be searched, and have elements that have to be looked at.
@@ -170,10 +166,10 @@ class PatchPairs:
         m = patches.count
         motion = with_room(PatchMotion, m)
         self.bounds: PatchBounds = with_room(PatchBounds, m, motion=motion)
-        self._budget: PatchBudget = with_room(PatchBudget, m)
+        self.budget: PatchBudget = with_room(PatchBudget, m)
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree: BoxTree = with_room(BoxTree, 2 * patches.leaves, leaves=patches.leaves)
-        self._moving = MovingPatches(patches.corner_lists, self.bounds, self._budget)
+        self._moving = MovingPatches(patches.corner_lists, self.bounds, self.budget)
         self.counters: Counters = with_room(Counters, 3)
         self._first_known = ti.ndarray(ti.i32, 2 * max(m, 1))
         self._maxima = LaneReduction(maxima=7, sums=0)
@@ -204,8 +200,8 @@ class PatchPairs:
         """
         self._fits = fits
         self._half_thickness, self._still = 0.5 * thickness, STILL * thickness if fits else LARGEST_STILL
-        self._budget.margin.fill(MARGIN * thickness)
-        self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
+        self.budget.margin.fill(MARGIN * thickness)
+        self.budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
     def look(self, state: ClothState, ageing: Ageing | None = None) -> Callable[[], tuple[float, bool]]:
         """Note where patches are and how they move in this substep.
@@ -239,7 +235,7 @@ class PatchPairs:
             patches.count,
             self.bounds.low,
             self.bounds.high,
-            self._budget,
+            self.budget,
             *SUBSTEPS_OF_PATCHES,
             PATCH_REACH_IN_EDGES * edge,
             0.5 * edge,

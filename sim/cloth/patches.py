@@ -1,18 +1,31 @@
-"""Patches: a cloth's triangles in groups that lie together, with their edges and vertices, and a tree over them."""
+"""Patches: a cloth's triangles in groups that lie together, with their edges and vertices, and a tree over them; bounds
+of their elements, laid out so that a processor compares one element with a block of them.
+"""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import PatchElements, PatchNodes
+from sim.cloth.bundles import EdgeBlocks, PatchElements, PatchNodes, TriangleBlocks
 from sim.core.arrays import on_device
 from sim.core.reductions import runs_on_gpu
 
 if TYPE_CHECKING:
     from sim.cloth.state import HostCloths
+
+BLOCK = 16
+"""Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""
+
+FAR = 1.0e9
+"""Coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32."""
+
+NONE = -1
+"""In the place of a vertex: the block has no element there."""
 
 TRIANGLES_PER_PATCH, ON_GPU = 32, 24
 """Most triangles of a patch: few enough for all of them to move nearly as one, and enough for one pair of patches to
@@ -102,3 +115,39 @@ def _key(pairs: NDArray[np.integer], count: int) -> NDArray[np.int64]:
     """A number for each pair of vertices, in the order of sorted pairs."""
     key: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
     return key
+
+
+class ElementBlocks:
+    """Edges and triangles of each patch in whole blocks, which are filled up with elements that are far from all.
+
+    One array for each component, and blocks of a length that the compiler knows: so it compares eight elements in an
+    instruction, where it took one after another from arrays of vectors.
+
+    Attributes:
+        edges: first block of each patch, (m + 1,); ends of the edges, (p,) ivec2, `NONE` in places that only fill up;
+            then x, y, z of their midpoints, and half their vectors [m], (p,) each.
+        triangles: first block of each patch, (m + 1,); corners, (q,) ivec3; then their boxes' lowest x, y, z, and
+            highest [m], (q,) each.
+
+    Args:
+        patches: of the cloths.
+    """
+
+    def __init__(self, patches: Patches) -> None:
+        self.edges = EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
+        self.triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
+
+
+def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:
+    """First block of each patch, the elements in their places, and room for six components."""
+    numbers, starts = elements.to_numpy(), first.to_numpy()[: count + 1].astype(np.int64)
+    blocks: NDArray[np.int64] = np.concatenate([[0], np.cumsum(-(-np.diff(starts) // BLOCK))]).astype(np.int64)
+    places = max(int(blocks[-1]), 1) * BLOCK
+    padded = np.full((places, numbers.shape[1]), NONE, dtype=np.int32)
+    for block, (start, end) in zip(blocks, pairwise(starts), strict=False):
+        padded[block * BLOCK : block * BLOCK + end - start] = numbers[start:end]
+    return (
+        on_device(np.resize(blocks, max(len(blocks), 2))),
+        on_device(padded),
+        *(ti.ndarray(ti.f32, places) for _ in range(6)),
+    )

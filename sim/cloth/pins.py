@@ -6,11 +6,10 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.motion import move_pinned
 from sim.cloth.parameters import ClothParameters, PinParameters
 from sim.cloth.sheet import RestSheet
 from sim.cloth.start import path_of_pin, pinned_nodes
-from sim.cloth.state import ClothState
+from sim.cloth.state import ClothState, move_pinned
 from sim.core.arrays import on_device
 from sim.core.motion import rotation
 from sim.core.motion.paths import KeyframePath

@@ -8,10 +8,20 @@ import taichi as ti
 from sim.cloth.bundles import Lines
 from sim.cloth.device_cells import SHEAR_SWEEPS
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, strips_of
-from sim.cloth.row_springs import bend_lines, measure_lines, solve_cells_in_rows, solve_lines, straighten_lines
+from sim.cloth.row_springs import (
+    LANES,
+    bend_lines,
+    load_blocks,
+    measure_excess_in_lines,
+    measure_lines,
+    row_blocks,
+    solve_cells_in_rows,
+    solve_lines,
+    store_blocks,
+    straighten_lines,
+    strips_of,
+)
 from sim.cloth.sheet import Grid
-from sim.cloth.spring_convergence import measure_excess_in_lines
 from sim.cloth.springs import bend_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
 from sim.core.host_access import put
@@ -139,7 +149,7 @@ class RectangleSprings:
             )
 
     def excess(self, dt: float) -> tuple[float, int]:
-        """Largest excess of a spring [rest lengths], and how many have not converged (`spring_convergence`)."""
+        """Largest excess of a spring [rest lengths], and how many have not converged (`threads.excess_of`)."""
         state = self._state
         found = [
             measure_excess_in_lines(

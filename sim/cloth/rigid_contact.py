@@ -19,12 +19,12 @@ from sim.cloth.bundles import (
     Walls,
     Weights,
 )
+from sim.cloth.near_pairs import lanes_of_pair
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision import Box
-from sim.cloth.self_collision_kernels import lanes_of_pair
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func
@@ -213,6 +213,7 @@ class RigidContact:
         state: ClothState,
         patches: Patches,
         motion: PatchMotion,
+        margin: ti.Ndarray,
         contacts: ContactList,
         recovery: float,
     ) -> Callable[[], list[int]]:
@@ -223,6 +224,7 @@ class RigidContact:
             state: at the start of a substep.
             patches: of the cloths.
             motion: of them in it.
+            margin: how far contacts may displace each [m].
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
@@ -232,6 +234,7 @@ class RigidContact:
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
             self._taken,
             motion,
+            margin,
             self._largest_half,
             state.surface,
             state.inverse_mass,
@@ -278,8 +281,10 @@ def fastest_approach(
 
 
 @func
-def touch_wall(i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: ti.f32, contacts: Contacts):
-    """Append a vertex if it reaches a wall.
+def touch_wall(
+    i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: ti.f32, allowed: ti.f32, contacts: Contacts
+):
+    """Append a vertex if it reaches a wall, or would if it were displaced by what is `allowed` besides [m].
 
     Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
     both.
@@ -287,7 +292,7 @@ def touch_wall(i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: t
     x, half, n = surface.position[i], 0.5 * surface.thickness[i], walls.plane[w].xyz
     distance = n.dot(x) - walls.plane[w].w
     least = least_displacement(distance, half, recovery)
-    if distance < half or n.dot(surface.displacement[i]) < least:
+    if distance < half or n.dot(surface.displacement[i]) < least + allowed:
         depth = ti.max(2.0 * WALL_DEPTH * half, walls.spacing, surface.displacement[i].norm())
         is_above = (x >= walls.low[w] - depth * walls.joined_low[w]).all()
         is_below = (x <= walls.high[w] + depth * walls.joined_high[w]).all()
@@ -297,9 +302,9 @@ def touch_wall(i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: t
 
 
 @func
-def may_touch_bodies(m: ti.i32, patch: PatchMotion, largest_half: ti.f32, bodies: CollidingBodies) -> ti.i32:
-    """Whether points of a patch may come as near to a body's sphere as `touch_bodies` asks for."""
-    may = 0
+def bodies_near(m: ti.i32, patch: PatchMotion, largest_half: ti.f32, bodies: CollidingBodies) -> ti.i32:
+    """To the spheres of how many bodies points of a patch may come as near as `touch_body` asks for."""
+    near = 0
     for b in range(bodies.count):
         r = patch.centre[m] - bodies.position[b]
         spin = bodies.motion[2 * b + 1]
@@ -307,8 +312,29 @@ def may_touch_bodies(m: ti.i32, patch: PatchMotion, largest_half: ti.f32, bodies
         relative += (patch.turn[m].norm() + spin.norm()) * patch.radius[m] + patch.rest[m]
         reach = WITH_ROUNDING * (bodies.radius[b] + patch.radius[m] + largest_half + relative)
         if r.norm_sqr() < reach * reach:
-            may = 1
-    return may
+            near += 1
+    return near
+
+
+@func
+def is_wall_near(m: ti.i32, w: ti.i32, patch: PatchMotion, largest_half: ti.f32, walls: Walls) -> ti.u1:
+    """Whether points of a patch may come as near to a wall as `touch_wall` asks for."""
+    reach = patch.shift[m].norm() + (1.0 + patch.turn[m].norm()) * patch.radius[m] + patch.rest[m]
+    above = walls.plane[w].xyz.dot(patch.centre[m]) - walls.plane[w].w
+    return above < WITH_ROUNDING * (reach + largest_half)
+
+
+@func
+def allowed_between(
+    m: ti.i32, patch: PatchMotion, margin: Floats, largest_half: ti.f32, walls: Walls, bodies: CollidingBodies
+) -> ti.f32:
+    """How far contacts may displace a patch into what it does not touch yet [m]: where several bodies or walls are
+    near, one may push it into another, which has to be among its contacts then.
+    """
+    near = bodies_near(m, patch, largest_half + margin[m], bodies)
+    for w in range(walls.count):
+        near += ti.cast(is_wall_near(m, w, patch, largest_half + margin[m], walls), ti.i32)
+    return ti.select(near > 1, margin[m], 0.0)
 
 
 @func
@@ -323,10 +349,12 @@ def touch_body(
     across: ti.math.mat3,
     half: ti.f32,
     recovery: ti.f32,
+    allowed: ti.f32,
     bodies: CollidingBodies,
     contacts: Contacts,
 ):
-    """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps.
+    """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps, or would with
+    what is `allowed` besides [m].
 
     Of its gradient there only what is `across` the element counts in which this point is the nearest to the body: on
     an edge of the body gradients are those of its faces, which would push the element along itself. How deep it is gets
@@ -334,14 +362,15 @@ def touch_body(
     """
     r = x - bodies.position[b]
     relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
-    reach = bodies.radius[b] + keeps + relative.norm()
+    comes = relative.norm() + allowed
+    reach = bodies.radius[b] + keeps + comes
     if r.norm_sqr() < reach * reach:
         turned = bodies.rotation[b]
         y = turned.transpose() @ r + bodies.centre_of_mass[b]
         distance = distance_to(y, b, bodies.shapes)
         if half > 0.0 and -0.5 * distance / half > bodies.depth[b]:
             ti.atomic_max(bodies.depth[b], -0.5 * distance / half)
-        if distance < keeps + relative.norm():
+        if distance < keeps + comes:
             gradient = ti.math.vec3(0.0)
             for axis in range(3):  # not unrolled: a distance takes long to compile
                 ahead = ti.math.vec3(0.0)
@@ -350,7 +379,7 @@ def touch_body(
             n = turned @ unit_or(gradient, y)
             n = unit_or(across @ n, n)
             least = least_displacement(distance, keeps, recovery)
-            if distance < keeps or n.dot(relative) < least:
+            if distance < keeps or n.dot(relative) < least + allowed:
                 friction = ti.sqrt(own_friction * bodies.friction[b])
                 append_contact(contacts, corners, weight, n, least, b, r, friction)
 
@@ -388,6 +417,7 @@ def find_rigid_contacts(
     work: ti.math.ivec2,
     taken: Integers,
     motion: PatchMotion,
+    margin: Floats,
     largest_half: ti.f32,
     surface: Surface,
     inverse_mass: Floats,
@@ -411,17 +441,16 @@ def find_rigid_contacts(
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < vertices.count * lanes:
             m = item // lanes
-            reach = motion.shift[m].norm() + (1.0 + motion.turn[m].norm()) * motion.radius[m] + motion.rest[m]
+            allowed = allowed_between(m, motion, margin, largest_half, walls, bodies)
             for w in range(walls.count):
-                above = walls.plane[w].xyz.dot(motion.centre[m]) - walls.plane[w].w
-                is_near = above < WITH_ROUNDING * (reach + largest_half)
+                is_near = is_wall_near(m, w, motion, largest_half + allowed, walls)
                 place = ti.select(is_near, vertices.first[m], vertices.first[m + 1]) + item % lanes
                 while place < vertices.first[m + 1]:
-                    touch_wall(vertices.nodes[place], w, surface, walls, recovery, contacts)
+                    touch_wall(vertices.nodes[place], w, surface, walls, recovery, allowed, contacts)
                     place += lanes
             if ti.static(meets != NO_BODIES):
-                may_touch = may_touch_bodies(m, motion, largest_half, bodies)
-                place = ti.select(may_touch == 1, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                near = bodies_near(m, motion, largest_half + allowed, bodies)
+                place = ti.select(near > 0, vertices.first[m], vertices.first[m + 1]) + item % lanes
                 while place < vertices.first[m + 1]:
                     i = vertices.nodes[place]
                     half = 0.5 * surface.thickness[i]
@@ -437,6 +466,7 @@ def find_rigid_contacts(
                             ti.Matrix.identity(ti.f32, 3),
                             ti.select(inverse_mass[i] > 0.0, half, 0.0),
                             recovery,
+                            allowed,
                             bodies,
                             contacts,
                         )
@@ -448,11 +478,12 @@ def find_rigid_contacts(
             item = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
             while item < elements.count * lanes:
                 m = item // lanes
-                may_touch = may_touch_bodies(m, motion, largest_half, bodies)
+                allowed = allowed_between(m, motion, margin, largest_half, walls, bodies)
+                near = bodies_near(m, motion, largest_half + allowed, bodies)
                 # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
                 edges = elements.first_edge[m + 1] - elements.first_edge[m]
                 end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
-                place = ti.select(may_touch == 1, item % lanes, end)
+                place = ti.select(near > 0, item % lanes, end)
                 while place < end:
                     corners = Three(0)
                     if place < edges:
@@ -462,7 +493,7 @@ def find_rigid_contacts(
                         corners = elements.triangles[elements.first_triangle[m] + place - edges]
                     for b in range(bodies.count):
                         if bodies.shows[b] > ti.cast(place < edges, ti.i32):
-                            touch_triangle(b, corners, surface, inverse_mass, recovery, bodies, contacts)
+                            touch_triangle(b, corners, surface, inverse_mass, recovery, allowed, bodies, contacts)
                     place += lanes
                 item = next_item(item, worker, taken, 1, PATCHES_AT_A_TIME)
     found = ti.math.ivec3(contacts.counter[0], contacts.counter[1], contacts.counter[2])
@@ -478,10 +509,12 @@ def touch_triangle(
     surface: Surface,
     inverse_mass: Floats,
     recovery: ti.f32,
+    allowed: ti.f32,
     bodies: CollidingBodies,
     contacts: Contacts,
 ):
-    """Append a body if it comes too near to a triangle between its corners, or to an edge: a, b, b.
+    """Append a body if it comes too near to a triangle between its corners, or to an edge: a, b, b; `allowed` is as of
+    `touch_body`.
 
     What is nearest at an edge is left to that where edges are looked at, too. A triangle with a corner that a pin holds
     in the body is where the job wants it. The distance to a convex body is a convex function: it sags nowhere below
@@ -490,21 +523,21 @@ def touch_triangle(
     v, third = corners, 1.0 / 3.0
     half = 0.5 * surface.thickness[v[0]]
     y, u, x = Corners(0.0), Corners(0.0), Corners(0.0)
-    farthest, nearest = 0.0, 1.0e30
+    comes, nearest = 0.0, 1.0e30
     for k in ti.static(range(3)):
         r = surface.position[v[k]] - bodies.position[b]
         relative = surface.displacement[v[k]] - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
-        farthest, nearest = ti.max(farthest, relative.norm()), ti.min(nearest, r.norm())
+        comes, nearest = ti.max(comes, relative.norm() + allowed), ti.min(nearest, r.norm())
         at = bodies.rotation[b].transpose() @ r + bodies.centre_of_mass[b]
         for axis in ti.static(range(3)):
             x[k, axis], u[k, axis] = surface.position[v[k]][axis], surface.displacement[v[k]][axis]
             y[k, axis] = at[axis]
     size = ti.max((y[1, :] - y[0, :]).norm(), (y[2, :] - y[0, :]).norm())
-    if nearest < bodies.radius[b] + half + size + farthest:
+    if nearest < bodies.radius[b] + half + size + comes:
         in_middle = distance_to(y.transpose() @ ti.math.vec3(third), b, bodies.shapes)
         # Outside of its grid a distance is at most three times too large: the body is in the grid, it is 1-Lipschitz.
         is_grid = bodies.shapes.kind[b] == GRID
-        if ti.select(is_grid, third * in_middle, in_middle) < half + size + farthest:
+        if ti.select(is_grid, third * in_middle, in_middle) < half + size + comes:
             sag, is_held = -in_middle, False
             for k in range(3):
                 share = ti.math.vec3(ti.cast(k == 0, ti.f32), ti.cast(k == 1, ti.f32), ti.cast(k == 2, ti.f32))
@@ -538,6 +571,7 @@ def touch_triangle(
                         across,
                         half,
                         recovery,
+                        allowed,
                         bodies,
                         contacts,
                     )

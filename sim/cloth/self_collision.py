@@ -9,13 +9,11 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, PatchMotion, Rest
-from sim.cloth.element_blocks import ElementBlocks
-from sim.cloth.near_pairs import find_near_pairs
+from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, Rest
+from sim.cloth.near_pairs import find_near_pairs, range_of_vectors
 from sim.cloth.patch_pairs import PairList, PatchPairs
-from sim.cloth.patches import Patches
+from sim.cloth.patches import ElementBlocks, Patches
 from sim.cloth.proximity_contacts import ContactList
-from sim.cloth.self_collision_kernels import range_of_vectors
 from sim.core.arrays import on_device
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
@@ -46,6 +44,8 @@ class SelfCollision:
     skin up. What is found in the lists does not depend on when they were made.
 
     Attributes:
+        patches: of the cloths.
+        patch_pairs: which of them may meet, where they are, and how they move.
         with_triangles, of_edges: the listed pairs.
         thickness: the largest [m].
         mean_edge: at rest, of all cloths together [m]; how far lists reach.
@@ -59,15 +59,15 @@ class SelfCollision:
     """
 
     def __init__(self, state: ClothState) -> None:
-        self._patches = Patches(state.host)
-        self._met = PatchPairs(self._patches)
+        self.patches = Patches(state.host)
+        self.patch_pairs = PatchPairs(self.patches)
         self._rest = Rest(state.body, on_device(state.host.position))
-        blocks = ElementBlocks(self._patches)
-        self._blocks = PatchBlocks(self._patches.vertex_lists, blocks.triangles, blocks.edges)
+        blocks = ElementBlocks(self.patches)
+        self._blocks = PatchBlocks(self.patches.vertex_lists, blocks.triangles, blocks.edges)
         self._collides = ti.ndarray(ti.i32, len(state.names))
         self._ends, self._taken = ti.ndarray(ti.i32, 4), ti.ndarray(ti.i32, 4)
         self.with_triangles, self.of_edges = (
-            PairList(capacity=capacity, pieces=self._met.capacity, ends=self._ends, number=number)
+            PairList(capacity=capacity, pieces=self.patch_pairs.capacity, ends=self._ends, number=number)
             for number, capacity in enumerate((state.vertex_count, state.edge_count))
         )
         edges = state.host.position[state.host.edges]
@@ -100,17 +100,17 @@ class SelfCollision:
             self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
             self.forget()
         self.meets = len(state.names) > 1 or any(state.self_collision)
-        self._met.set_margin(self.thickness, fits=self.meets)
+        self.patch_pairs.set_margin(self.thickness, fits=self.meets)
 
     @property
     def searches(self) -> float:
         """How often the elements of a patch were searched since `begin_frame`, on average."""
-        return self._searched / max(self._patches.count, 1)
+        return self._searched / max(self.patches.count, 1)
 
     def look(self, state: ClothState) -> None:
         """Note how cloth moves in this substep."""
         is_aged = self.meets and not (self._is_forgotten or self._is_outrun)
-        self._asked = self._met.look(state, self._ageing if is_aged else None)
+        self._asked = self.patch_pairs.look(state, self._ageing if is_aged else None)
         self._looked: tuple[float, bool] | None = None
         self._is_searched = False
 
@@ -121,7 +121,7 @@ class SelfCollision:
         if self._looked is None:
             motion, holds = self._asked()
             self._is_outrun |= not holds
-            self._searched += self._met.expired_count
+            self._searched += self.patch_pairs.expired_count
             self._looked = (motion, holds) if self.meets else (0.0, True)
         return self._looked
 
@@ -130,13 +130,13 @@ class SelfCollision:
         """How pairs of patches are aged."""
         edge = self.mean_edge
         least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        return Ageing(
-            self.thickness, least_skin, self.with_triangles.on_device.piece_due, self.of_edges.on_device.piece_due
-        )
+        due, due_edges = (pairs.on_device.piece_due for pairs in (self.with_triangles, self.of_edges))
+        return Ageing(self.thickness, least_skin, due, due_edges)
 
     def warm_up(self) -> None:
-        """Compile what carries lists over."""
-        self.with_triangles.carry(0, self._met.carried, self._met.capacity)
+        """Compile what carries lists over, and what makes room in them."""
+        self.with_triangles.carry(0, self.patch_pairs.carried, self.patch_pairs.capacity)
+        self.with_triangles.resize(self.with_triangles.capacity)
 
     def finish(
         self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
@@ -145,9 +145,9 @@ class SelfCollision:
         if not (self.meets or is_changed or self._was_changed):
             self.outcome = self._nothing
             return lambda: [0, 0, 0]
-        self.outcome = self._met.counters.found
+        self.outcome = self.patch_pairs.counters.found
         self._was_changed, negligible = is_changed, NEGLIGIBLE * self.thickness
-        return self._met.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
+        return self.patch_pairs.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.
@@ -162,7 +162,7 @@ class SelfCollision:
             recovery: share of a missing distance that the substep gives back [-].
             is_ahead: not to wait for what `look` has found; if pairs of patches do not hold, nothing is appended.
         """
-        met, lists = self._met, (self.with_triangles, self.of_edges)
+        met, lists = self.patch_pairs, (self.with_triangles, self.of_edges)
         if not is_ahead or self._is_forgotten or self._is_outrun:
             self.looked()
         if not self.meets:
@@ -201,21 +201,6 @@ class SelfCollision:
         """
         lists = (self.with_triangles, self.of_edges)
         return True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
-
-    @property
-    def motion(self) -> PatchMotion:
-        """Of the patches in the substep."""
-        return self._met.bounds.motion
-
-    @property
-    def patches(self) -> Patches:
-        """Of the cloths."""
-        return self._patches
-
-    @property
-    def patch_pairs(self) -> PatchPairs:
-        """Which patches may meet, where they are, and how they move."""
-        return self._met
 
 
 def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Callable[[], Box]:

@@ -1,8 +1,7 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -10,11 +9,10 @@ from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir
 from sim.cloth.cells import cells_of
+from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.device_cells import DeviceCells
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
-from sim.cloth.load import NodeLoad
-from sim.cloth.motion import finish_step
 from sim.cloth.parameters import (
     DEFAULT_SUBSTEPS,
     MOST_REFINED,
@@ -30,7 +28,7 @@ from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import joined, springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
-from sim.cloth.state import ClothState, HostCloths
+from sim.cloth.state import ClothState, HostCloths, NodeLoad, finish_step
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
@@ -69,39 +67,6 @@ LIVE_KEYS = frozenset(
 """What may change between frames."""
 
 
-class ClothContacts(Protocol):
-    """A kind of contact: of cloths with themselves and each other, with bodies, with walls."""
-
-    def stable_dt(self, state: ClothState, at_most: float) -> float:
-        """Largest step [s] for the current state, `at_most` this one."""
-
-    def resolve(
-        self,
-        state: ClothState,
-        dt: float,
-        relax: Callable[[], Callable[[], bool]],
-        conclude: Callable[[ti.Ndarray], None] | None = None,
-    ) -> bool:
-        """Change the displacements of a step of dt [s], after the springs have; pinned nodes stay as they are.
-
-        Returns whether the step was concluded.
-
-        Args:
-            state: with displacements.
-            dt: [s].
-            relax: asks how long springs are. The answer lets them change displacements once more where contacts
-                stretched them too much, and says whether it did; contacts are resolved again then.
-            conclude: has the device finish the step if three numbers there are 0, as they are where nothing remains to
-                be done: a GPU would wait while the host reads them. If contacts of another kind follow, there is none.
-        """
-
-    def begin_frame(self) -> None:
-        """Reset the counters of the frame, and forget what a run that continues here would not know."""
-
-    def diagnostics(self) -> Mapping[str, float]:
-        """Numbers about the contacts of the frame, by name."""
-
-
 class ClothSolver:
     """All cloths of a scene, as they share their substeps and collide with each other.
 
@@ -113,7 +78,7 @@ class ClothSolver:
         state: of all nodes.
         parameters: of the cloths, as they are now.
         gravity: [m/s²]; may be changed between frames.
-        contacts: resolved in this order in every substep.
+        contacts: of the cloths with each other, bodies and walls; None where they pass through all.
         load: what a coupling lays onto the nodes in every substep, if any does.
         air: at every triangle, the wind unless a coupling puts other air there.
         warnings: what was repaired in meshes, a sentence each.
@@ -152,7 +117,7 @@ class ClothSolver:
                 raise ValueError(f'cloth "{cloth.name}": {reason}')
         self.state = ClothState(host, reach=reach)
         self.gravity = gravity
-        self.contacts: list[ClothContacts] = []
+        self.contacts: ContinuousContacts | None = None
         self.load: NodeLoad | None = None
         shared = self.parameters[0]
         in_rows = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
@@ -179,10 +144,6 @@ class ClothSolver:
         self._sweeps = self._refinement = 1
         self._excess = 0.0
         self._hold_pins()
-
-    def add_contacts(self, contacts: ClothContacts) -> None:
-        """Resolve these too in every substep, after those that are there."""
-        self.contacts.append(contacts)
 
     def change(self, name: str, **changes: object) -> None:
         """Change parameters of a cloth between frames, by the keys of a job; nothing is built anew.
@@ -273,9 +234,7 @@ class ClothSolver:
         steps, and gains energy.
         """
         dt = min(self._asked_dt, self._free_dt / self._refinement)
-        for contacts in self.contacts:
-            dt = contacts.stable_dt(self.state, dt)
-        return dt
+        return dt if self.contacts is None else self.contacts.stable_dt(self.state, dt)
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
@@ -325,11 +284,7 @@ class ClothSolver:
                 at_end = integrator.excess(dt)
             finish_step(state.nodes, state.motion, state.position, state.limit, dt, reasons)
 
-        is_concluded = False
-        for contacts in self.contacts:
-            is_last = contacts is self.contacts[-1]
-            is_concluded = contacts.resolve(state, dt, relax, conclude if is_last else None)
-        if not is_concluded:
+        if self.contacts is None or not self.contacts.resolve(state, dt, relax, conclude):
             conclude(self._no_reasons)
         if excess is None:
             assert at_end is not None
@@ -348,8 +303,8 @@ class ClothSolver:
         """A frame starts at simulated time `time_s` [s]."""
         self._time_s = time_s
         self._hold_pins()  # as `restore` does: both take their first step from what pins hold now
-        for contacts in self.contacts:
-            contacts.begin_frame()
+        if self.contacts is not None:
+            self.contacts.begin_frame()
 
     def synchronize(self) -> None:
         """Wait until the device has done all that it was asked to, as measurements of time need."""
@@ -459,7 +414,6 @@ class ClothSolver:
         nodes = self._totals.of_nodes(self.gravity)
         lost = nodes.pop("lost")
         del nodes["not_finite"]
-        contacts = {name: value for each in self.contacts for name, value in each.diagnostics().items()}
         return {
             "mass": self._mass,
             "node_count": float(self.state.vertex_count),
@@ -467,7 +421,7 @@ class ClothSolver:
             **self._totals.of_springs(),
             **self._integrator.diagnostics(),
             "nodes_lost": lost,
-            **contacts,
+            **({} if self.contacts is None else self.contacts.diagnostics()),
         }
 
     def remedies(self) -> Remedies:

@@ -14,10 +14,12 @@ from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet
 from sim.cloth.springs import edges_of
 from sim.cloth.start import quantum_of, start_positions
-from sim.core.arrays import Vectors, on_device
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import with_room
 from sim.core.host_access import copied
 from sim.core.launch import kernel
+from sim.core.parameters import Vector3
+from sim.core.reductions import is_finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,3 +213,112 @@ def round_positions(nodes: Nodes, carry: Vectors, position: Vectors):
     for i in range(nodes.lattice.shape[0]):
         position[i] = ti.cast(nodes.lattice[i], ti.f32) * nodes.quantum
         nodes.displacement[i] = carry[i]
+
+
+LARGEST_MOVE = 2.0**29
+"""Most quanta in a step: a quarter of the lattice, so that integers do not overflow."""
+
+
+@kernel
+def move_pinned(
+    nodes: Integers,
+    arm: Vectors,
+    carry: Vectors,
+    shift: ti.math.vec3,
+    turn_x: ti.math.vec3,
+    turn_y: ti.math.vec3,
+    turn_z: ti.math.vec3,
+    displacement: Vectors,
+):
+    """Displace pinned nodes by a shift, and by the change of a rotation, given by rows, times their arms."""
+    for k in range(nodes.shape[0]):
+        turned = ti.math.vec3(turn_x.dot(arm[k]), turn_y.dot(arm[k]), turn_z.dot(arm[k]))
+        displacement[nodes[k]] = carry[nodes[k]] + shift + turned
+
+
+@kernel
+def finish_step(
+    nodes: Nodes,
+    motion: NodeMotion,
+    position: Vectors,
+    limit: ti.i32,
+    dt: ti.f32,
+    reasons: Integers,
+):
+    """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
+
+    A velocity changes by what the displacement differs from dt times itself: the same as the displacement over dt, but
+    for the rounding of 1/dt, which would make all velocities grow or shrink alike. Nodes stop at the ends of the
+    lattice. Where a displacement is not finite, the velocity shows it.
+
+    Nothing is done unless the three `reasons` why the substep may not be over are 0.
+    """
+    end = ti.select(reasons[0] + reasons[1] + reasons[2] == 0, position.shape[0], 0)
+    for i in range(end):
+        u_i = nodes.displacement[i]
+        v_i = motion.velocity[i] + (u_i - (motion.carry[i] + dt * motion.velocity[i])) / dt
+        for axis in ti.static(range(3)):
+            if is_finite(u_i[axis]):
+                quanta = ti.round(u_i[axis] / nodes.quantum)
+                rest = u_i[axis] - quanta * nodes.quantum
+                whole = ti.cast(ti.max(-LARGEST_MOVE, ti.min(quanta, LARGEST_MOVE)), ti.i32)
+                place = nodes.lattice[i][axis] + whole
+                if ti.abs(place) >= limit:
+                    place = ti.max(-limit, ti.min(place, limit))
+                    rest = 0.0
+                    v_i[axis] = 0.0
+                nodes.lattice[i][axis] = place
+                position[i][axis] = ti.cast(place, ti.f32) * nodes.quantum
+                motion.carry[i][axis] = rest
+        motion.velocity[i] = v_i
+        nodes.displacement[i] = motion.carry[i]
+
+
+class NodeLoad:
+    """Mass that moves along with the nodes in a substep without weighing on them, and impulses.
+
+    Attributes:
+        mass: of each node's load [kg], (n,).
+        impulse: on each node together with its load [N s], (n,) vec3.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.mass, self._own_inverse = ti.ndarray(ti.f32, count), ti.ndarray(ti.f32, count)
+        self.impulse = ti.Vector.ndarray(3, ti.f32, count)
+
+    def put_on(self, state: ClothState, gravity: Vector3, dt: float) -> None:
+        """Let the nodes take their impulses and carry their loads; gravity [m/s²] is what they will feel in dt [s]."""
+        put_on_load(
+            self.mass, self.impulse, ti.math.vec3(*gravity), dt, state.inverse_mass, self._own_inverse, state.velocity
+        )
+
+    def take_off(self, state: ClothState) -> None:
+        """Give the nodes their own masses back."""
+        take_off_load(self._own_inverse, state.inverse_mass)
+
+
+@kernel
+def put_on_load(
+    mass: Floats,
+    impulse: Vectors,
+    gravity: ti.math.vec3,
+    dt: ti.f32,
+    inverse_mass: Floats,
+    own_inverse: Floats,
+    velocity: Vectors,
+):
+    """v_n += J_n/(m_n + m_load), less what gravity would do to the load, with the mass of both from then on."""
+    for n in range(inverse_mass.shape[0]):
+        w_n = inverse_mass[n]
+        own_inverse[n] = w_n
+        if w_n > 0.0:
+            with_load = w_n / (1.0 + mass[n] * w_n)
+            velocity[n] += with_load * (impulse[n] - dt * mass[n] * gravity)
+            inverse_mass[n] = with_load
+
+
+@kernel
+def take_off_load(own_inverse: Floats, inverse_mass: Floats):
+    """The masses that nodes had before."""
+    for n in range(inverse_mass.shape[0]):
+        inverse_mass[n] = own_inverse[n]

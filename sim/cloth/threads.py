@@ -7,8 +7,8 @@ import taichi as ti
 
 from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, colour_bounds
-from sim.cloth.spring_convergence import measure_excess
 from sim.cloth.state import ClothState
+from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
 
@@ -27,6 +27,10 @@ LEAST_WEIGHT = 1.0e-20
 
 LEAST_ALIKE = 0.995
 """Cosine of the angle that a spring may turn by in a step for its direction to be that of the start."""
+
+LARGEST_RESIDUAL = 0.5
+"""Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
+rubber sheet does that a heavy ball falls into; a bag of water that hangs from four nodes is drawn out to spikes."""
 
 
 class ThreadSolver:
@@ -100,7 +104,7 @@ class ThreadSolver:
 
     def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
         """Asks for the largest excess of a spring [rest lengths], and how many have not converged
-        (`spring_convergence`).
+        (`excess_of`).
         """
         springs = self.springs
         return measure_excess.later(
@@ -274,3 +278,47 @@ def straighten_threads(
                 )
                 if i >= 0:
                     nodes.displacement[i] = nodes.displacement[i] + (turned - change)
+
+
+@func
+def excess_of(
+    i: ti.i32,
+    j: ti.i32,
+    rest: ti.f32,
+    shift: ti.f32,
+    stiffness: ti.f32,
+    multiplier: ti.f32,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+) -> ti.f32:
+    """(|d| - rest + shift + l/(k dt²)) / rest, nothing for a spring between two nodes that are held.
+
+    Where a spring is solved, its multiplier is -k dt² times its stretch. What is solved after it moves its nodes on,
+    and what that leaves is no stretch of the material: it falls with every sweep, and with the square of the step.
+    Rubber that is drawn to twice its length has none of it.
+    """
+    d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
+        nodes.displacement[i] - nodes.displacement[j]
+    )
+    excess = (d.norm() - rest + shift + multiplier / (stiffness * dt_squared)) / rest
+    return ti.select(nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0, excess, 0.0)
+
+
+@kernel
+def measure_excess(
+    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
+) -> ti.math.vec2:
+    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
+    end = count
+    found[0], found[1] = 0, 0
+    for s in range(end):
+        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+        excess = excess_of(
+            i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
+        )
+        bits = ti.bit_cast(excess, ti.i32)  # those of numbers from 0 on are in their order
+        if excess > 0.0 and bits > found[0]:  # all others would wait in line to change nothing
+            ti.atomic_max(found[0], bits)
+        if excess > LARGEST_RESIDUAL:
+            ti.atomic_add(found[1], 1)
+    return ti.math.vec2(ti.bit_cast(found[0], ti.f32), ti.cast(found[1], ti.f32))

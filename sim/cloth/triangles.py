@@ -6,9 +6,8 @@ from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, Triang
 from sim.cloth.cells import OWN_SHARE, TRIANGLE
 from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
 from sim.cloth.device_springs import TINY_LENGTH
-from sim.cloth.spring_convergence import LARGEST_RESIDUAL
 from sim.cloth.state import ClothState
-from sim.cloth.threads import STRAIGHTENED, direction_of
+from sim.cloth.threads import LARGEST_RESIDUAL, STRAIGHTENED, direction_of
 from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import func, with_room
 from sim.core.launch import kernel
@@ -422,7 +421,7 @@ def finish_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, exp
 
 @kernel
 def measure_node_excess(system: TriangleSystem, nodes: Nodes, expected: Strains, share: Share) -> Results:
-    """Largest excess of strain of nodes of triangles, as `spring_convergence` has it, and how many along warp and weft
+    """Largest excess of strain of nodes of triangles, as `threads.excess_of` has it, and how many along warp and weft
     are beyond `LARGEST_RESIDUAL`.
     """
     tree, mesh = ti.static((share.tree, system.mesh))

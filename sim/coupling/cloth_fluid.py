@@ -8,9 +8,9 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.load import NodeLoad
 from sim.cloth.sheet import RestSheet, build_sheet, triangle_areas
 from sim.cloth.solver import ClothSolver
+from sim.cloth.state import NodeLoad
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel

@@ -97,6 +97,6 @@ def irregular_square(
     vertices = np.concatenate([border, points])
     triangles = Delaunay(vertices).simplices
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    area = 0.5 * np.abs(np.cross(b - a, c - a))
+    area = 0.5 * np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1)))
     vertices = np.concatenate([vertices, np.zeros((len(vertices), 1))], axis=1)
     return vertices, triangles[area > 0.02 * spacing**2].astype(np.int32)

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from sim.build import build_world
 from sim.cloth.continuous_contacts import ContinuousContacts
-from sim.cloth.motion import finish_step
 from sim.cloth.patch_pairs import PairList
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision import SelfCollision
 from sim.cloth.solver import ClothSolver
-from sim.cloth.state import ClothState
+from sim.cloth.state import ClothState, finish_step
 from sim.core.world import World
 from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
@@ -67,17 +66,16 @@ def find(state: ClothState, pairs: SelfCollision) -> ContactList:
 
 
 def contacts_of(solver: ClothSolver) -> ContinuousContacts:
-    (contacts,) = solver.contacts
-    assert isinstance(contacts, ContinuousContacts)
-    return contacts
+    assert solver.contacts is not None
+    return solver.contacts
 
 
 def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float = 1.0e-3) -> NDArray[np.float64]:
     """One substep that leads every node this far if contacts allow it [m]; the displacements that they allowed."""
     state = solver.state
     state.displacement.from_numpy(displacement.astype(np.float32))
-    for contacts in solver.contacts:
-        contacts.resolve(state, dt, lambda: lambda: False)
+    if solver.contacts is not None:
+        solver.contacts.resolve(state, dt, lambda: lambda: False)
     allowed = state.displacement.to_numpy().astype(np.float64)
     finish_step(state.nodes, state.motion, state.position, state.limit, dt, solver._no_reasons)
     return allowed

@@ -269,18 +269,16 @@ class _Watch:
 
 def bodies_of(world: World) -> list[tuple[BodyGeometry, Points, Points]]:
     """Shape, place and turn of every body, as the cloth's contacts know them."""
-    from sim.cloth.continuous_contacts import ContinuousContacts
     from sim.cloth.solver import ClothSolver
 
     found = []
     for cloth in world.solvers.values():
-        for contacts in cloth.contacts if isinstance(cloth, ClothSolver) else ():
-            if isinstance(contacts, ContinuousContacts):
-                seen = contacts.rigid.bodies
-                places, turns = (
-                    each.to_numpy().astype(np.float64) for each in (seen.colliding.position, seen.colliding.rotation)
-                )
-                found += list(zip(seen.geometries, places, turns, strict=False))
+        if isinstance(cloth, ClothSolver) and cloth.contacts is not None:
+            seen = cloth.contacts.rigid.bodies
+            places, turns = (
+                each.to_numpy().astype(np.float64) for each in (seen.colliding.position, seen.colliding.rotation)
+            )
+            found += list(zip(seen.geometries, places, turns, strict=False))
     return found
 
 

@@ -113,6 +113,21 @@ def test_a_heavy_body_rests_on_cloth_and_not_on_what_is_below(shape, lowest, tab
     assert strains[-1] < strains[15] + 0.005
 
 
+def test_what_one_body_pushes_another_holds():
+    """Cloth just over a table is led into the wedge below a ball, which pushes it down.
+
+    As after an earlier blow, contacts may push as far as they like without the sheet being looked at again.
+    """
+    top, thickness = 0.35, 1.0e-3
+    sheet = {"shape": rectangle((0.004, 0.004), (5, 5)), "thickness": thickness, "friction": 0.0}
+    ball = {"shape": {"type": "sphere", "radius": 0.02}, "position": (0.0, 0.0, top + 0.0202)}
+    solver = cloth_of(world_of({**sheet, "position": (0.016, 0.0, top + 0.55 * thickness)}, bodies=[ball, TABLE]))
+    contacts_of(solver)._pairs.patch_pairs.budget.margin.fill(1.0)
+    moved = displace(solver, np.tile((-0.01, 0.0, 0.0), (25, 1)))
+    assert moved[:, 0].max() < -1.0e-3, "it was not led anywhere"
+    assert moved[:, 2].min() > -0.15 * thickness  # 0.1 of it was free
+
+
 def test_a_body_that_several_layers_do_not_carry_is_told_and_a_pin_in_a_post_is_not():
     """50 kg on five layers of nodes of 0.2 g; and an edge that is pinned in the middle of a bar."""
     layers = [{"shape": rectangle((0.2, 0.2), (6, 6)), "position": (0.0, 0.0, 0.5e-3 * (k + 1))} for k in range(5)]
@@ -513,7 +528,7 @@ def test_cloth_is_not_pushed_by_what_it_only_passes():
     body = geometry(BALL)
     contact = RigidContact([body], [0.5], ())
     contact.place(Poses(np.array([[0.0, 0.0, 0.0517]]), np.eye(3)[None]))
-    solver.add_contacts(ContinuousContacts(solver.state, rigid=contact))
+    solver.contacts = ContinuousContacts(solver.state, rigid=contact)
     sideways = np.zeros((25, 3))
     sideways[:, 0] = 5e-4
     np.testing.assert_array_equal(displace(solver, sideways), sideways.astype(np.float32))

@@ -9,11 +9,11 @@ from cloth_scenes import WEIGHTLESS, cloth, rectangle, solver_of
 from contact_scenes import find, listed_pairs, listed_places
 
 from sim.cloth.bundles import Ageing
+from sim.cloth.near_pairs import UNKNOWN
 from sim.cloth.patch_pairs import PatchPairs
 from sim.cloth.patches import TRIANGLES_PER_PATCH, Patches
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision import SelfCollision
-from sim.cloth.self_collision_kernels import UNKNOWN
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 

@@ -67,7 +67,7 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
     find(state, pairs)
     found, found_edges = listed_pairs(pairs)
     # A pair of patches is searched as far as its own motion asks for, to a thickness at least.
-    reach = pairs._met.on_device.reach.to_numpy()[: pairs._met.count].max()
+    reach = pairs.patch_pairs.on_device.reach.to_numpy()[: pairs.patch_pairs.count].max()
     assert reach < 0.1
     triangles = state.host.triangles
     vertex, triangle = (each.ravel() for each in np.mgrid[0:49, 0 : len(triangles)])
@@ -100,7 +100,7 @@ def _expect_listed(found, candidates, distance, radius, reach):
 def crumpled(count, contacts=True):
     solver = solver_of(cloth(shape=rectangle((0.3, 0.3), (count, count)), thickness=5e-3), gravity=WEIGHTLESS)
     if contacts:
-        solver.add_contacts(ContinuousContacts(solver.state))
+        solver.contacts = ContinuousContacts(solver.state)
     return solver
 
 
@@ -175,7 +175,7 @@ def test_layers_at_rest_share_their_weight_in_the_short_steps_of_explicit_spring
     )
     dt = solver.stable_dt()
     assert dt < 1.1e-5
-    solver.add_contacts(ContinuousContacts(solver.state))
+    solver.contacts = ContinuousContacts(solver.state)
     mass = solver.state.mass.to_numpy().astype(np.float64)[:, None]
     thrown = np.zeros((882, 3), dtype=np.float32)
     thrown[441:, 2] = -9.81 * dt**2
@@ -440,7 +440,7 @@ def test_contacts_do_not_depend_on_the_number_of_threads(threads):
 def test_what_contacts_do_in_every_substep_is_foreseen():
     """A sheet that wind presses on the floor is pushed back as far each time: nothing has to be looked at twice."""
     world = world_of({"wind": (0.0, 0.0, -30.0), "air_density": 1.2, "position": (0.0, 0.0, 0.01)})
-    (contacts,) = cloth_of(world).contacts
+    contacts = contacts_of(cloth_of(world))
     rounds, find = [], contacts._find
     contacts._find = lambda *arguments: rounds.append(find(*arguments)) or rounds[-1]
     for _ in range(8):

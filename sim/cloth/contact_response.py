@@ -1,0 +1,543 @@
+"""What contacts do to the displacements of a substep: a projected Jacobi iteration that keeps momentum.
+
+The displacements u are those nearest to the predicted ones, in the norm of the masses, for which every contact has
+n . w >= floor, w = sum_k c_k u_k; friction then takes tangential displacement away, within Coulomb's cone. With
+P_c the impulse of contact c times the step, M u changes by sum_c c_k P_c, so that both sides get the same.
+
+All contacts push at once. That overshoots where vertices share contacts; by Cauchy's inequality
+|sum_c c_ic P_c|² <= S_i sum_c |c_ic| |P_c|², S_i = sum_c |c_ic|, the matrix of the problem is at most the diagonal
+D_c = sum_i |c_ic| S_i / m_i, and steps of the residual over D_c converge (mass splitting, Tonge et al. 2012, with
+weights). Where all contacts push alike, as between two layers, D_c is exact and one step does; momentum (Nesterov 1983,
+of contacts Mazhar et al. 2015) brings the others.
+
+Sums over contacts are sums of integers, in units far below anything that matters: the same for any order of contacts
+and threads.
+
+A node under a heavy body on a floor passes on what neither its mass nor twenty steps could: D_c of it is ten thousand
+times too large for the body, which would fall through. So nodes between what stands and a body that moves have a
+`support` e: they answer to contacts by (1 - e²)/m, about as heavily as the body. What the answer keeps from them is the
+floor's, so that the momentum of cloth and bodies changes by what stands alone. Nodes that are pressed from both sides
+do not leave or enter either whatever their mass. But the cloth's own springs pull them from under the body more easily
+than its friction would let them.
+"""
+
+import taichi as ti
+
+from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, PushedNodes
+from sim.cloth.proximity import unit_or
+from sim.cloth.proximity_contacts import INACTIVE, WALL
+from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
+from sim.core.bundles import func
+from sim.core.launch import large_kernel
+from sim.core.reductions import runs_on_gpu
+from sim.core.warps import add_to, largest_in_warp, whole_warps
+
+Given = ti.types.vector(6, ti.i64)
+"""What a body gets of contacts, in their units: impulse and moment."""
+
+AT_A_TIME = 64
+"""Contacts whose impulses on a body a thread of a CPU sums up by itself."""
+
+
+@func
+def relative_displacement(c: ti.i32, contacts: Contacts, displacement: Vectors, body_motion: Vectors) -> ti.math.vec3:
+    """Of the first side of a contact against the second, or against the body [m]."""
+    w = ti.math.vec3(0.0)
+    for k in ti.static(range(4)):
+        if contacts.weights[c][k] != 0.0:
+            w += contacts.weights[c][k] * displacement[contacts.vertices[c][k]]
+    b = contacts.kind[c]
+    if b >= 0:
+        w -= body_motion[2 * b] + body_motion[2 * b + 1].cross(contacts.arm[c])
+    return w
+
+
+@func
+def answered(
+    c: ti.i32, ahead: ti.math.vec3, contacts: Contacts, impulses: Impulses, displacement: Vectors, body_motion: Vectors
+) -> ti.math.vec3:
+    """The impulse of a contact that has one, by which displacements lead, after a step of the residual over D."""
+    n = contacts.normal[c]
+    w = relative_displacement(c, contacts, displacement, body_motion)
+    along = ti.max(ahead.dot(n) + (contacts.floor[c] - w.dot(n)) / impulses.mobility[c], 0.0)
+    sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / impulses.mobility[c]
+    held, length = contacts.friction[c] * along, sideways.norm()
+    if length > held:
+        sideways *= held / length
+    return along * n + sideways
+
+
+@ti.func
+def body_mobility(arm: ti.math.vec3, inverse_mass: ti.f32, inverse_inertia: ti.math.mat3) -> ti.f32:
+    """Upper bound of how much a body's point moves per impulse on it [1/kg]."""
+    return inverse_mass + arm.norm_sqr() * ti.math.mat3(inverse_inertia).norm()
+
+
+@ti.func
+def give_body(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers):
+    """Add the opposite of an impulse, in units, to what a body gets, to the nearest unit."""
+    give(opposite_of(push, arm), body, body_gathered)
+
+
+@ti.func
+def opposite_of(push: ti.math.vec3, arm: ti.math.vec3) -> Given:
+    """The opposite of an impulse, in units, and of its moment, to the nearest unit."""
+    twist = arm.cross(push)
+    given = Given(0)
+    for axis in ti.static(range(3)):
+        given[axis], given[3 + axis] = -ti.round(push[axis], ti.i64), -ti.round(twist[axis], ti.i64)
+    return given
+
+
+@ti.func
+def give(given: Given, body: ti.i32, body_gathered: LongIntegers):
+    """Add what a body gets; of body -1 nothing."""
+    if body >= 0:
+        for axis in ti.static(range(6)):
+            ti.atomic_add(body_gathered[6 * body + axis], given[axis])
+
+
+@ti.func
+def give_body_together(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers, item: ti.i32):
+    """The same where all threads of a warp call it, for body -1 where there is none: one addition for most of them."""
+    common = largest_in_warp(body)
+    if body >= 0 and body != common:
+        give_body(push, body, arm, body_gathered)
+    if common >= 0:
+        own = ti.cast(body == common, ti.f32)
+        p, twist = own * push, own * arm.cross(push)
+        for axis in ti.static(range(3)):
+            add_to(body_gathered, 6 * common + axis, -ti.round(p[axis], ti.i64), item)
+            add_to(body_gathered, 6 * common + 3 + axis, -ti.round(twist[axis], ti.i64), item)
+
+
+@ti.func
+def thickness_between(vertices: ti.types.vector(4, ti.i32), thickness: Floats) -> ti.f32:
+    """Distance that the sides of a pair keep [m]; of a contact with a body or a wall, the thickness of the cloth."""
+    return 0.5 * (thickness[vertices[0]] + thickness[vertices[3]])
+
+
+SHARES_PER_UNIT = 65536.0
+"""Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
+
+MOST_ALIKE = -0.95
+"""A vertex is between two sides, and gets a `support`, if the cosine of the angle of their normals is below this: a
+heavy node that meets the edge of a body obliquely would kick it."""
+
+LEAST_COSINE = 0.86
+"""Contacts are turned to the support of their vertices if the cosine of the angle between both lines is larger."""
+
+LEAST_ANSWER = 1.0e-6
+"""Of a vertex that has a support: float32 cannot tell less from none."""
+
+
+@func
+def hold(c: ti.i32, contacts: Contacts, most: ti.f32, sums: NodeSums):
+    """Sum up which way the vertices of a contact are held by what stands, and pressed by a body that moves."""
+    side = ti.select(most > 0.0, 3, 0)
+    for k in ti.static(range(4)):
+        if contacts.weights[c][k] != 0.0:
+            v = contacts.vertices[c][k]
+            part = (ti.abs(contacts.weights[c][k]) * SHARES_PER_UNIT) * contacts.normal[c]
+            for axis in ti.static(range(3)):
+                ti.atomic_add(sums.held_sums[6 * v + side + axis], ti.round(part[axis], ti.i32))
+            if most > 0.0:
+                ti.atomic_max(sums.lever[v], ti.sqrt(most))
+                ti.atomic_max(sums.pressing_body[v], contacts.kind[c])
+
+
+@func
+def support_between(i: ti.i32, held_sums: Integers, lighter: ti.f32) -> ti.math.vec3:
+    """Support of a vertex of which a body's share of a contact's mobility is `lighter` times its own; 0 if free."""
+    stands, presses = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    for axis in ti.static(range(3)):
+        stands[axis] = ti.cast(held_sums[6 * i + axis], ti.f32)
+        presses[axis] = ti.cast(held_sums[6 * i + 3 + axis], ti.f32)
+    support = ti.math.vec3(0.0)
+    if lighter < 1.0 and stands.norm_sqr() > 0.0 and presses.norm_sqr() > 0.0:
+        stands, presses = stands.normalized(), presses.normalized()
+        if stands.dot(presses) < MOST_ALIKE:
+            support = ti.sqrt(1.0 - ti.max(lighter, LEAST_ANSWER)) * stands
+    return support
+
+
+@func
+def turned_to_support(c: ti.i32, contacts: Contacts, support: Vectors) -> ti.math.vec3:
+    """Normal of a contact of vertices that have a support: along that, as far as friction holds the wedge.
+
+    Where a ball rests on cloth on a floor, their forces are opposite, along the normal of the floor, and friction is
+    what turns that of the ball. To find it by iteration takes too many steps: what is left drives cloth out of the
+    wedge.
+    """
+    n = contacts.normal[c]
+    axis, is_supported = ti.math.vec3(0.0), True
+    for k in ti.static(range(4)):
+        if contacts.weights[c][k] != 0.0:
+            own = support[contacts.vertices[c][k]]
+            is_supported = is_supported and own.norm_sqr() > 0.0
+            axis += ti.abs(contacts.weights[c][k]) * unit_or(own, n)
+    if is_supported:
+        axis = unit_or(axis, n)
+        along = axis.dot(n)
+        across = n - along * axis
+        if ti.abs(along) > LEAST_COSINE:
+            steepness, held = across.norm(), contacts.friction[c] * ti.abs(along)
+            n = (along * axis + ti.max(1.0 - held / ti.max(steepness, 1.0e-9), 0.0) * across).normalized()
+    return n
+
+
+@ti.func
+def answer_of(support: ti.math.vec3) -> ti.f32:
+    """By how much of what its mass says a vertex answers to contacts."""
+    return 1.0 - support.norm_sqr()
+
+
+LEAST_FREE_WEIGHT = 0.05
+"""A contact pushes only if its vertices that no pin holds have so much of its weight, so that none moves more than
+twenty times what the contact lacks. Others are only watched: a corner far from a contact of two pins is no lever."""
+
+ALONE = -1
+"""In the place of the first use of a vertex: what stands touches it, and nothing else does."""
+
+
+@large_kernel
+def weigh_contacts(
+    contacts: Contacts,
+    impulses: Impulses,
+    vertex_count: ti.i32,
+    nodes: PushedNodes,
+    sums: NodeSums,
+    bodies: PushedBodies,
+    is_first: ti.i32,
+):
+    """List the contacts that push, and compute their diagonal D; before the first round of what was found, forget their
+    impulses, and keep what displacements were `predicted` as it was looked for.
+
+    `counter` gets how many there are, and how many vertices they push, which are listed too. Contacts whose free
+    vertices weigh less than `LEAST_FREE_WEIGHT` do not push.
+
+    Which of them push a vertex, by their places in `pushing`, and with what weights, is listed in `used_by` and
+    `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
+    without the twelve atomic sums that each contact would otherwise take.
+
+    What stands and touches a vertex that nothing else touches is settled at once: its D is exact, so that one step
+    solves it, and no other contact hears of it. In draped cloth these are most of all that push.
+
+    If bodies may move, each vertex between what stands and a body that moves gets its `support`, and its contacts a
+    normal along that, from `held_sums`, `lever` and `pressing_body`.
+    """
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, vertices_end, weighed_end = contacts.counter[3], vertex_count, whole_warps(contacts.counter[3])
+    all_end = ti.max(vertex_count, bodies.count)
+    for k in ti.static(range(5)):
+        sums.counter[k] = 0
+    for i in range(all_end):
+        if i < vertex_count:
+            sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
+            if is_first == 1:
+                sums.predicted[i] = nodes.displacement[i]
+            if bodies.may_move == 1:
+                sums.lever[i], sums.pressing_body[i] = 0.0, -1
+                for k in ti.static(range(6)):
+                    sums.held_sums[6 * i + k] = 0
+        if i < bodies.count:
+            bodies.load[i] = ti.cast(0, ti.i64)
+    for c in range(contacts_end):
+        impulses.mobility[c] = 0.0
+        if contacts.floor[c] > 0.5 * INACTIVE:
+            free = 0.0
+            for k in ti.static(range(4)):
+                if contacts.weights[c][k] != 0.0:
+                    share = ti.cast(ti.ceil(ti.abs(contacts.weights[c][k]) * SHARES_PER_UNIT), ti.i32)
+                    ti.atomic_add(sums.shares[contacts.vertices[c][k]], share)
+                    ti.atomic_add(nodes.uses[2 * contacts.vertices[c][k] + 1], 1)
+                    if nodes.inverse_mass[contacts.vertices[c][k]] > 0.0:
+                        free += ti.abs(contacts.weights[c][k])
+            b = contacts.kind[c]
+            most = 0.0
+            if b >= 0:
+                most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
+                if most > 0.0:
+                    ti.atomic_add(bodies.load[b], ti.cast(ti.ceil(ti.sqrt(most) / bodies.load_unit), ti.i64))
+                    free = 1.0
+            if is_of_vertex_and_what_stands(c, contacts, bodies):
+                ti.atomic_add(nodes.uses[2 * contacts.vertices[c][0]], 1)
+            if bodies.may_move == 1 and (b >= 0 or b == WALL):
+                hold(c, contacts, most, sums)
+            if free >= LEAST_FREE_WEIGHT:
+                impulses.mobility[c] = 1.0
+    for i in range(vertices_end):
+        if nodes.uses[2 * i] == 1 and nodes.uses[2 * i + 1] == 1:
+            nodes.uses[2 * i] = ALONE
+        elif sums.shares[i] > 0:
+            nodes.touched[ti.atomic_add(sums.counter[1], 1)] = i
+            first = ti.atomic_add(sums.counter[2], nodes.uses[2 * i + 1])
+            nodes.uses[2 * i], nodes.uses[2 * i + 1] = first, first
+        if bodies.may_move == 1:
+            b = sums.pressing_body[i]
+            nodes.support[i] = ti.math.vec3(0.0)
+            if b >= 0 and nodes.inverse_mass[i] > 0.0:
+                of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
+                own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
+                nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
+    for first in range(weighed_end):
+        # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
+        if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
+            continue
+        given_body, given = -1, Given(0)
+        for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
+            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
+            if c < contacts_end and impulses.mobility[c] > 0.0:
+                if is_first == 1:
+                    impulses.impulse[c] = ti.math.vec3(0.0)
+                v = contacts.vertices[c][0]
+                if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
+                    impulses.mobility[c] = nodes.inverse_mass[v]
+                    push, body, arm = settle(c, contacts, impulses, nodes, bodies), contacts.kind[c], contacts.arm[c]
+                    if sums.counter[4] == 0:
+                        sums.counter[4] = 1
+                else:
+                    place = ti.atomic_add(sums.counter[0], 1)
+                    impulses.pushing[place] = c
+                    impulses.mobility[c] = weighed(c, place, contacts, impulses, nodes, sums, bodies)
+            if ti.static(runs_on_gpu()):
+                give_body_together(push, body, arm, bodies.impulse, c)
+            elif body >= 0:
+                if body != given_body:
+                    give(given, given_body, bodies.impulse)
+                    given_body, given = body, Given(0)
+                given += opposite_of(push, arm)
+        give(given, given_body, bodies.impulse)
+
+
+@func
+def weighed(
+    c: ti.i32,
+    place: ti.i32,
+    contacts: Contacts,
+    impulses: Impulses,
+    nodes: PushedNodes,
+    sums: NodeSums,
+    bodies: PushedBodies,
+) -> ti.f32:
+    """The diagonal D of a contact, which gets its place among the uses of its vertices, and its normal."""
+    if bodies.may_move == 1 and (contacts.kind[c] >= 0 or contacts.kind[c] == WALL):
+        contacts.normal[c] = turned_to_support(c, contacts, nodes.support)
+    total = 0.0
+    for k in ti.static(range(4)):
+        weight = ti.abs(contacts.weights[c][k])
+        if weight > 0.0:
+            v = contacts.vertices[c][k]
+            own = weight * nodes.inverse_mass[v] * (ti.cast(sums.shares[v], ti.f32) / SHARES_PER_UNIT)
+            total += answer_of(nodes.support[v]) * own
+            use = ti.atomic_add(nodes.uses[2 * v + 1], 1)
+            impulses.used_by[use], impulses.use_weight[use] = place, contacts.weights[c][k]
+    b = contacts.kind[c]
+    if b >= 0:
+        most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
+        total += ti.sqrt(most) * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
+    return total
+
+
+@func
+def is_of_vertex_and_what_stands(c: ti.i32, contacts: Contacts, bodies: PushedBodies) -> ti.u1:
+    """Whether a contact is one of a single vertex with a wall, or with a body that no push moves."""
+    b = contacts.kind[c]
+    stands = b == WALL
+    if b >= 0:
+        stands = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b]) == 0.0
+    return stands and contacts.weights[c][0] == 1.0
+
+
+@func
+def settle(c: ti.i32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies) -> ti.math.vec3:
+    """Push the only vertex of a contact, which has no other, by all that it lacks; returns that, in units."""
+    v, before = contacts.vertices[c][0], impulses.impulse[c]
+    after = answered(c, before, contacts, impulses, nodes.displacement, bodies.motion)
+    push = (after - before) / impulses.unit
+    impulses.impulse[c] = after
+    nodes.displacement[v] += (nodes.inverse_mass[v] * impulses.unit) * ti.round(push)
+    return push
+
+
+STEPS = 8
+"""Steps of the iteration in one launch: what all iterations have at least."""
+
+Momenta = ti.types.vector(STEPS + 1, ti.f32)
+
+
+@func
+def push_apart(
+    momenta: Momenta,
+    starts: ti.i32,
+    count: ti.i32,
+    touched_count: ti.i32,
+    contacts: Contacts,
+    impulses: Impulses,
+    nodes: PushedNodes,
+    bodies: PushedBodies,
+):
+    """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
+
+    The first launch of an iteration, which `starts` it, notes where that is.
+
+    A step starts from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them. It leaves the
+    displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
+    """
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, touched_end = count, touched_count
+    moved_end = touched_count + bodies.count
+    new_end = starts * ti.max(count, touched_count, bodies.count)
+    for place in range(new_end):
+        if place < touched_count:
+            i = nodes.touched[place]
+            nodes.start[i] = nodes.displacement[i]
+            nodes.reached[i] = nodes.displacement[i]
+        if place < bodies.count:
+            for m in ti.static(range(2)):
+                bodies.motion_start[2 * place + m] = bodies.motion[2 * place + m]
+                bodies.motion_reached[2 * place + m] = bodies.motion[2 * place + m]
+        if place < count:
+            c = impulses.pushing[place]
+            impulses.impulse_before[c] = impulses.impulse[c]
+            impulses.impulse_given[c] = impulses.impulse[c]
+    for step in ti.static(range(STEPS)):
+        for place in range(contacts_end):
+            push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
+        for place in range(moved_end):
+            if place < touched_end:
+                move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
+            else:
+                move_body(place - touched_end, momenta[step + 1], impulses, bodies)
+
+
+@func
+def push_contact(
+    place: ti.i32, momentum: ti.f32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies
+):
+    """What a contact gives in a step, from its place in `pushing`."""
+    c = impulses.pushing[place]
+    ahead = impulses.impulse[c] + momentum * (impulses.impulse[c] - impulses.impulse_before[c])
+    after = answered(c, ahead, contacts, impulses, nodes.displacement, bodies.motion)
+    impulses.impulse_before[c] = impulses.impulse[c]
+    impulses.impulse[c] = after
+    impulses.push[place] = (after - ahead) / impulses.unit
+    # What nothing moves need not hear of it before the end: its sums are in the way of all threads.
+    b = contacts.kind[c]
+    most = 0.0
+    if b >= 0 and (after - ahead).norm_sqr() > 0.0:
+        most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
+    if most > 0.0:
+        give_body(impulses.push[place], b, contacts.arm[c], bodies.gathered)
+
+
+@func
+def given_to(i: ti.i32, uses: Integers, impulses: Impulses) -> ti.math.vec3:
+    """Sum of what the contacts of a vertex give it, in units, each to the nearest unit."""
+    x, y, z = ti.cast(0, ti.i64), ti.cast(0, ti.i64), ti.cast(0, ti.i64)
+    for use in range(uses[2 * i], uses[2 * i + 1]):
+        part = impulses.use_weight[use] * impulses.push[impulses.used_by[use]]
+        x, y, z = x + ti.round(part[0], ti.i64), y + ti.round(part[1], ti.i64), z + ti.round(part[2], ti.i64)
+    return ti.math.vec3(ti.cast(x, ti.f32), ti.cast(y, ti.f32), ti.cast(z, ti.f32))
+
+
+@func
+def move_node(i: ti.i32, momentum: ti.f32, impulses: Impulses, nodes: PushedNodes):
+    """Displace a vertex by what its contacts give it in a step, and ahead by the momentum of the next."""
+    given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
+    u = nodes.displacement[i] + (nodes.inverse_mass[i] * impulses.unit) * given
+    nodes.displacement[i] = u + momentum * (u - nodes.reached[i])
+    nodes.reached[i] = u
+
+
+@func
+def move_body(b: ti.i32, momentum: ti.f32, impulses: Impulses, bodies: PushedBodies):
+    """The same of a body."""
+    shift = bodies.motion[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(bodies.gathered, 6 * b)
+    turn = bodies.motion[2 * b + 1] + impulses.unit * (bodies.inverse_inertia[b] @ take(bodies.gathered, 6 * b + 3))
+    bodies.motion[2 * b] = shift + momentum * (shift - bodies.motion_reached[2 * b])
+    bodies.motion[2 * b + 1] = turn + momentum * (turn - bodies.motion_reached[2 * b + 1])
+    bodies.motion_reached[2 * b] = shift
+    bodies.motion_reached[2 * b + 1] = turn
+
+
+@ti.func
+def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
+    """Three sums of integers, which are zero then."""
+    push = ti.math.vec3(0.0)
+    for axis in ti.static(range(3)):
+        push[axis] = ti.cast(gathered[first + axis], ti.f32)
+        gathered[first + axis] = ti.cast(0, ti.i64)
+    return push
+
+
+@func
+def finish_push(
+    finishes: ti.i32,
+    count: ti.i32,
+    touched_count: ti.i32,
+    contacts: Contacts,
+    impulses: Impulses,
+    nodes: PushedNodes,
+    bodies: PushedBodies,
+):
+    """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
+
+    Nothing where it does not finish yet: a kernel with it and one without would be compiled, for seconds each.
+    """
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, touched_end, bodies_end = finishes * count, finishes * touched_count, finishes * bodies.count
+    for place in range(contacts_end):
+        c = impulses.pushing[place]
+        impulses.push[place] = (impulses.impulse[c] - impulses.impulse_given[c]) / impulses.unit
+        if contacts.kind[c] >= 0:
+            give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
+    for place in range(touched_end):
+        i = nodes.touched[place]
+        given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
+        nodes.displacement[i] = nodes.start[i] + (nodes.inverse_mass[i] * impulses.unit) * given
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for b in range(bodies_end):
+        for axis in ti.static(range(6)):
+            bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
+        bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(
+            bodies.gathered, 6 * b
+        )
+        twist = impulses.unit * take(bodies.gathered, 6 * b + 3)
+        bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
+
+
+TOLERANCE = 0.02
+"""Part of their thickness by which contacts may miss what they should keep."""
+
+
+@large_kernel
+def push(
+    momenta: Momenta,
+    starts: ti.i32,
+    finishes: ti.i32,
+    contacts: Contacts,
+    impulses: Impulses,
+    nodes: PushedNodes,
+    sums: NodeSums,
+    thickness: Floats,
+    bodies: PushedBodies,
+) -> ti.math.ivec4:
+    """Some steps of the iteration of a round (`weigh_contacts`), and where they lead if it `finishes`.
+
+    Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
+    `TOLERANCE` then, and whether any were settled.
+    """
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    pushing_count, touched_count = sums.counter[0], sums.counter[1]
+    measured_end = finishes * pushing_count
+    push_apart(momenta, starts, pushing_count, touched_count, contacts, impulses, nodes, bodies)
+    finish_push(finishes, pushing_count, touched_count, contacts, impulses, nodes, bodies)
+    for place in range(measured_end):
+        c = impulses.pushing[place]
+        w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
+        missing = contacts.floor[c] - w.dot(contacts.normal[c])
+        if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
+            sums.counter[3] = 1
+    return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])
