@@ -65,7 +65,11 @@ class Joints:
     impulses at its start hold the joints at its end, and impulses at its end hold their velocities; it is of second
     order, keeps momenta, and the energy without drift. Springs have the mean force of both ends, with which they swing
     on for ever. Bodies of a component that contacts or a fluid pushed take the velocity that joints and contacts find
-    together for the whole step, as bodies in contact do, and the joints hold at its end as well.
+    together for the whole step, as bodies in contact do, and the joints hold at its end as well. Where Newton's
+    method does not find where they hold, and no shorter step does either, velocities alone hold, which adds no energy.
+
+    Approximate: what contacts move apart, in poses alone, joints take back. A body that a joint jerks may be as deep in
+    another after that step as it moved in it.
 
     Attributes:
         names: (j,).
