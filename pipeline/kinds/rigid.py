@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
-    from pipeline.kinds.checks.rigid import check_anchors, check_ballast, check_places, check_rigid_start
+    from pipeline.kinds.checks.joints import check_anchors
+    from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
 
     check_places(job, solids, findings)
     check_rigid_start(job, solids, findings)

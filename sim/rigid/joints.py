@@ -13,7 +13,7 @@ from sim.core.solver import Arrays, Diagnostics
 from sim.rigid.contacts import Array, Indices, pair_keys
 from sim.rigid.joint_order import elimination_of
 from sim.rigid.joint_parameters import JointParameters, points_of
-from sim.rigid.joint_system import UNBOUNDED, JointDemand, JointSystem, solve_alone
+from sim.rigid.joint_system import UNBOUNDED, JointDemand, JointSolution, JointSystem, solve_alone
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.states import MovingBodies, turned_freely
 
@@ -28,6 +28,7 @@ HOLDS, LIMITS, DRIVES, PULLS = range(4)
 MOST_STEPS = 20  # of Newton's method to where the joints hold at the end of a step
 HELD = 1.0e-9  # change of a gap [m], [rad] by which these steps end: what is left is far less
 APART = 1.0e-6  # error that no impulse changes: what joints ask for is more than there is to move [m], [rad]
+DIVERGES = 4.0  # growth from one of these steps to another with which they end
 CLOSING_SHARE = 0.2  # of an error at the start of a step that is taken back in it
 TOUCHING = 1.0e-6  # a limit nearer than this counts as reached in an impact [m], [rad]
 REDUNDANT = 1.0e-9  # of the largest: rows of one body with smaller eigenvalues say what others say
@@ -64,7 +65,11 @@ class Joints:
     impulses at its start hold the joints at its end, and impulses at its end hold their velocities; it is of second
     order, keeps momenta, and the energy without drift. Springs have the mean force of both ends, with which they swing
     on for ever. Bodies of a component that contacts or a fluid pushed take the velocity that joints and contacts find
-    together for the whole step, as bodies in contact do, and the joints hold at its end as well.
+    together for the whole step, as bodies in contact do, and the joints hold at its end as well. Where Newton's
+    method does not find where they hold, and no shorter step does either, velocities alone hold, which adds no energy.
+
+    Approximate: what contacts move apart, in poses alone, joints take back. A body that a joint jerks may be as deep in
+    another after that step as it moved in it.
 
     Attributes:
         names: (j,).
@@ -218,7 +223,7 @@ class Joints:
 
         The velocities of the bodies are those with gravity; of kinematic bodies the means over the step.
         """
-        system, values = self._system(bodies, is_active, inverse_inertia)
+        system, values, _ = self._system(bodies, is_active, inverse_inertia)
         if not system.is_there.any():
             return None
         speeds = np.where(np.isnan(self._goal), self._speed, (self._goal - values) / self._response)
@@ -227,8 +232,8 @@ class Joints:
 
     def _system(
         self, bodies: MovingBodies, is_active: NDArray[np.bool_], inverse_inertia: Array
-    ) -> tuple[JointSystem, Array]:
-        """The rows where the bodies are now, and their values."""
+    ) -> tuple[JointSystem, Array, Array]:
+        """The rows where the bodies are now, their values, and the angles of all hinges [rad], (j,)."""
         frames = self._frames(bodies.position, bodies.orientation)
         direction = self._directions(frames)
         among = np.append(is_active, False)
@@ -236,7 +241,7 @@ class Joints:
         jacobian = self._jacobian(frames, direction)
         inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
         system = JointSystem.build(self._order, is_there, self._row_bodies, jacobian, inverse_mass, inverse_inertia)
-        return system, self._values(frames)
+        return system, self._values(frames), frames.angle
 
     def impacts(self, step: JointStep) -> JointDemand:
         """What joints ask while bodies bounce: what holds, holds."""
@@ -255,7 +260,8 @@ class Joints:
             [does == HOLDS, does == LIMITS, does == DRIVES, does == PULLS],
             [CLOSING_SHARE * values / dt, np.where(values > 0.0, 1.0, CLOSING_SHARE) * values / dt, -step.speeds, pull],
         )
-        return self._demand(step.system, bias, self._softness(np.full(len(does), dt), dt), *self._bounds(dt))
+        softness = self._softness(np.full(len(does), dt), dt)
+        return JointDemand(step.system, step.system.is_there, bias, softness, *self._bounds(dt))
 
     def _softness(self, duration_s: Array, dt: float) -> Array:
         """Velocity that a spring's impulse adds by giving way, (r,), of forces of such durations [s], (r,)."""
@@ -268,9 +274,6 @@ class Joints:
         lower = np.where(self._does == LIMITS, 0.0, -UNBOUNDED)
         most = self._strength * duration_s
         return np.where(drives, -most, lower), np.where(drives, most, UNBOUNDED)
-
-    def _demand(self, system: JointSystem, bias: Array, softness: Array, lower: Array, upper: Array) -> JointDemand:
-        return JointDemand(system, system.is_there, bias, softness, lower, upper)
 
     def hold(
         self,
@@ -325,46 +328,49 @@ class Joints:
         start = step.values
         wanted = np.where((self._does == HOLDS) | (start < 0.0), (1.0 - CLOSING_SHARE) * start, 0.0)
         wanted[np.abs(start) <= HELD] = 0.0
-        angle = self._angle
+        drives, pulls, holds = self._does == DRIVES, self._does == PULLS, system.is_there & (self._does == HOLDS)
+
+        def solve(values: Array) -> JointSolution:
+            """Impulses that take back what is wrong with the values at the end of the step."""
+            stretched = self._stiffness * 0.5 * (start + values) + self._damping * (values - start) / dt
+            bias = np.where(drives, (values - start) / dt - step.speeds, (values - wanted) / dt)
+            bias = np.where(pulls, softness * (total + duration_s * stretched), bias)
+            return solve_alone(
+                JointDemand(system, system.is_there, bias, softness, lower - total, upper - total), still
+            )
+
+        before, least = total, np.inf
         for _ in range(MOST_STEPS):
-            turning = spin[moving]
-            turning = np.where(is_held[moving, None], rotation.rotated(turn, turning), turning)
+            turning = np.where(is_held[moving, None], rotation.rotated(turn, spin[moving]), spin[moving])
             position[moving] = base_position + dt * (drift + change[moving, :3])
             free = turned_freely(
                 base_orientation, bodies.principal_orientation[moving], bodies.principal_moments[moving], turning, dt
             )
             orientation[moving] = np.where(is_led[:, None], led, free)
             frames = self._frames(position, orientation)
-            angle, values = frames.angle, self._values(frames)
-            bias = np.select(
-                [self._does == DRIVES, self._does == PULLS],
-                [
-                    (values - start) / dt - step.speeds,
-                    softness
-                    * (
-                        total
-                        + duration_s
-                        * (self._stiffness * 0.5 * (start + values) + self._damping * (values - start) / dt)
-                    ),
-                ],
-                (values - wanted) / dt,
-            )
-            found = solve_alone(self._demand(system, bias, softness, lower - total, upper - total), still)
+            values = self._values(frames)
+            found = solve(values)
             total = total + found.impulses
             change += found.velocity
             spin += system.torques(found.impulses)
-            if not found.converged:
+            moved = dt * float(np.abs(system.velocities(found.velocity))[system.is_there].max())
+            if not found.converged or not moved < DIVERGES * least:
                 break
-            if dt * float(np.abs(system.velocities(found.velocity))[system.is_there].max()) <= HELD:
-                holds = system.is_there & (self._does == HOLDS)
+            least = min(least, moved)
+            if moved <= HELD:
                 converged = float(np.max(np.abs(values - wanted), initial=0.0, where=holds)) <= APART
                 break
+        if not converged:
+            # As if joints stayed as they are: that adds no energy, and leaves gaps of second order.
+            total, velocity = before, still.copy()
+            velocity[:-1, :3], velocity[:-1, 3:] = bodies.velocity - fall, bodies.angular_velocity
+            velocity[:-1] += extra
+            found = solve(start + dt * system.velocities(velocity))
+            total, change = total + found.impulses, found.velocity
         bodies.velocity = bodies.velocity + change[:n, :3]
         bodies.angular_velocity = bodies.angular_velocity + change[:n, 3:]
-        joints_there = np.zeros(len(self), dtype=bool)
-        joints_there[self._joint[system.is_there]] = True
-        self._angle = np.where(joints_there, angle, self._angle)
-        return JointHold(step, whole, total, converged)
+        was_held = float(np.max(np.abs(start), initial=0.0, where=holds)) <= APART
+        return JointHold(step, whole, total, converged, was_held and not converged)
 
     def settle(
         self, hold: JointHold, bodies: MovingBodies, is_active: NDArray[np.bool_], inverse_inertia: Array
@@ -372,7 +378,10 @@ class Joints:
         """Change velocities at the end of a step so that they agree with the joints, and break what is overloaded."""
         step, dt = hold.step, hold.step.dt
         before = step.system
-        system, values = self._system(bodies, is_active, inverse_inertia)
+        system, values, angle = self._system(bodies, is_active, inverse_inertia)
+        is_there = np.zeros(len(self), dtype=bool)
+        is_there[self._joint[system.is_there]] = True
+        self._angle = np.where(is_there, angle, self._angle)
         does, first, whole = self._does, hold.impulses, hold.is_whole
         kick = np.where((does == PULLS) & ~whole & before.is_there, first, 0.0)
         velocity = system.change(kick)
@@ -413,7 +422,7 @@ class Joints:
         W - W Jᵀ (J W Jᵀ)⁺ J W of each body, without the parts that link its way and its turning, and the largest of the
         masses of all directions.
         """
-        system, _ = self._system(bodies, np.ones(len(bodies), dtype=bool), inverse_inertia)
+        system, _, _ = self._system(bodies, np.ones(len(bodies), dtype=bool), inverse_inertia)
         alone = system.is_there & (self._does == HOLDS) & ((system.movers >= 0).sum(axis=1) == 1)
         movers = system.movers.max(axis=1)
         for body in np.unique(movers[alone]):
@@ -545,6 +554,7 @@ class JointHold:
     is_whole: NDArray[np.bool_]  # rows whose impulses are those of the whole step, not of its first half, (r,)
     impulses: Array  # at the start of the step, (r,)
     converged: bool  # whether they hold at its end
+    is_too_long: bool  # whether a shorter step may do better: they held at its start
 
 
 def _unit(vectors: Array) -> Array:

@@ -35,6 +35,9 @@ SLEEP_SHARE, SLEEP_TIME_S = 0.1, 0.5
 """A group of bodies that touch sleeps when all of them were slower for such a time [s] than a share of the speed that
 gravity gives in the largest step: 2 mm/s on Earth, by which they get 1 mm in that time."""
 
+MOST_HALVINGS = 4
+"""How often a step is halved until joints find where they hold at its end: whips of light links may turn fast."""
+
 LOST_DISTANCE = 10.0  # a dynamic body farther from the domain's centre, in diagonals, is stopped: it fell out of sight
 
 SOLVER_NAME = "rigid"
@@ -175,10 +178,11 @@ class RigidSolver:
         self._place_kinematic_bodies(self.time_s)
         self._stop_lost_bodies()
 
-    def _advance(self, dt: float, time_s: float, is_active: NDArray[np.bool_]) -> None:
-        """Advance free bodies, (n,), by dt [s], and kinematic ones from a time [s] on."""
+    def _advance(self, dt: float, time_s: float, is_active: NDArray[np.bool_], halvings: int = MOST_HALVINGS) -> None:
+        """Advance free bodies, (n,), by dt [s], and kinematic ones from a time [s] on; by halves if joints ask it."""
         bodies = self.bodies
         before = (bodies.position.copy(), bodies.orientation.copy())
+        velocities = (bodies.velocity, bodies.angular_velocity.copy())
         free = is_active[:, None]
         bodies.velocity = bodies.velocity + np.where(free, dt * self.gravity, 0.0)
         self._set_mean_velocities_of_kinematic_bodies(time_s, dt)
@@ -207,6 +211,12 @@ class RigidSolver:
                 extra=extra,
                 is_held=outcome.is_held,
             )
+            if hold.is_too_long and halvings > 0:
+                bodies.position, bodies.orientation = before
+                bodies.velocity, bodies.angular_velocity = velocities
+                for half in range(2):
+                    self._advance(0.5 * dt, time_s + half * 0.5 * dt, is_active, halvings - 1)
+                return
 
         # A body in free flight moves by the mean of its velocities, which is exact; one in contact by the new one,
         # which is what the contacts allow, and so does one that a fluid pushed: the fluid is to see how it moves.

@@ -10,8 +10,8 @@ from pipeline.job.checks.optical_depth import check_optical_depths
 from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_set
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.kinds.base import Kind
+from pipeline.kinds.checks.joints import check_joints
 from pipeline.kinds.checks.memory_budget import MemoryBudget, free_bytes, memory_budget
-from pipeline.kinds.checks.rigid import check_joints
 from pipeline.kinds.checks.shapes import build_solids, in_scale
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.table import KINDS, bodies, described_material, is_meant, placements

@@ -8,13 +8,11 @@ from pipeline.kinds.base import Solids
 from pipeline.model.boxes import domain_box, overlap, simulated_regions, span
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
-from sim.rigid.joint_parameters import joint_problems, points_of
+from sim.rigid.joint_parameters import joint_problems
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import start_problems
 from sim.shapes.solid import ShapeError
 
-# Distance of a joint from its body, in radii of the body's box, from which it is told: a slip of an axis or a unit.
-FAR_JOINT = 3.0
 # Share of a body's size by which ballast on its surface may be outside, as decimals do not add up exactly.
 ROUND_OFF = 1.0e-6
 
@@ -66,29 +64,3 @@ def check_rigid_start(job: Job, solids: Solids, findings: Findings) -> None:
     index_of = {body.name: index for index, body in enumerate(job.rigid)}
     for problem in problems:
         findings.error(("rigid", index_of[problem.body]), problem.sentence)
-
-
-def check_joints(job: Job, findings: Findings) -> None:
-    """Note joints that the simulation would refuse."""
-    for problem in joint_problems(job.joint, job.rigid):
-        findings.error(("joint", problem.number, *([problem.key] if problem.key else [])), problem.sentence)
-
-
-def check_anchors(job: Job, solids: Solids, findings: Findings) -> None:
-    """Note joints far from the bodies that they hold, which an arm without mass would reach."""
-    index_of = {body.name: index for index, body in enumerate(job.rigid)}
-    refused = {problem.number for problem in joint_problems(job.joint, job.rigid)}
-    for number, joint in enumerate(job.joint):
-        if number in refused:
-            continue
-        for name, point in zip(joint.between, points_of(joint, job.rigid), strict=False):
-            solid = solids.get(("rigid", index_of[name]))
-            if solid is None:
-                continue
-            distance = float(solid.signed_distance(np.array([point]))[0])
-            low, high = solid.bounds
-            if distance > FAR_JOINT * 0.5 * float(np.linalg.norm(high - low)):
-                findings.warn(
-                    ("joint", number),
-                    f'is {distance:.3g} m away from "{name}", as if an arm without mass held it; is the place meant?',
-                )

@@ -432,3 +432,15 @@ def digest_after_some_time() -> str:
 
 def test_joints_and_contacts_do_not_depend_on_the_number_of_threads():
     result_on_any_threads(digest_after_some_time)
+
+
+def test_a_wheel_on_its_axle_answers_a_fluid_by_turning_alone():
+    wheel = body("wheel", {"type": "cylinder", "radius": 0.2, "height": 0.1}, (0, 0, 1))
+    free = body("free", ball(0.1), (0.5, 0, 1))
+    axle = joint("axle", "hinge", ("wheel",), anchor=(0, 0, 1), axis=(0, 0, 1))
+    solver = scene(wheel, free, joints=[axle])
+    inverse_mass, inverse_inertia = solver.mobility()
+    assert inverse_mass == pytest.approx([0.0, 1.0 / solver.bodies.mass[1]], abs=1e-12)
+    around = solver.bodies.inverse_inertia()
+    np.testing.assert_allclose(inverse_inertia[0], np.diag([0, 0, around[0, 2, 2]]), atol=1e-9 * around[0, 2, 2])
+    np.testing.assert_array_equal(inverse_inertia[1], around[1])
