@@ -89,7 +89,7 @@ def test_what_is_wrong_with_many_bodies_is_told_of_three_at_the_line_of_their_ta
     assert len(lines) == 4
     assert all(line.startswith("many.toml:") for line in lines)
     assert 'rigid bodies "brick_1" and "brick_5"' in told.errors[0] or '"brick_1"' in told.errors[0]
-    assert "more of the group likewise" in lines[-1]
+    assert "more like these in the group" in lines[-1]
 
 
 @pytest.mark.parametrize(
