@@ -38,5 +38,5 @@ def of_tables(job: Job, problems: Iterable[Problem]) -> list[Problem]:
             told.append(Problem(place, problem.message if is_named else f'"{name}" {problem.message}'))
         else:
             left_out[place] = left_out.get(place, 0) + 1
-    told += [Problem(place, f"and {number:,} more of the group likewise") for place, number in left_out.items()]
+    told += [Problem(place, f"and {number:,} more like these in the group") for place, number in left_out.items()]
     return told

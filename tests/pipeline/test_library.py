@@ -167,7 +167,7 @@ def test_what_no_force_moves_is_refused_with_its_reason():
         ("post", "stands still"),
         ("led", "kinematic"),
         ("plume", "takes no forces"),
-        ("bal", "bodies are"),
+        ("bal", 'no body is named "bal"; did you mean "ball"'),
     ):
         with pytest.raises(ValueError, match=reason):
             scene.add_force(body, [0.0, 0.0, 1.0])

@@ -14,7 +14,9 @@ from pipeline.base.errors import JobFileError
 from pipeline.base.layout import JobLayout
 from pipeline.job.input_files import input_files
 from pipeline.job.loading import read_job
-from pipeline.kinds.table import material_of, scene_objects
+from pipeline.kinds.checks.shapes import TRIANGLE_BYTES, build_solids
+from pipeline.kinds.table import material_of, placements, scene_objects
+from pipeline.model.problems import Findings
 from pipeline.stages.bodies import BodiesStage
 from pipeline.stages.render import RenderStage
 from pipeline.store.cache import open_bodies, read_frame, read_numbers, validate_frame
@@ -87,7 +89,7 @@ def test_what_is_wrong_with_many_bodies_is_told_of_three_at_the_line_of_their_ta
     assert len(lines) == 4
     assert all(line.startswith("many.toml:") for line in lines)
     assert 'rigid bodies "brick_1" and "brick_5"' in told.errors[0] or '"brick_1"' in told.errors[0]
-    assert "more of the group likewise" in lines[-1]
+    assert "more like these in the group" in lines[-1]
 
 
 @pytest.mark.parametrize(
@@ -143,6 +145,25 @@ def test_a_mesh_file_of_a_group_is_one_file_at_its_table(tmp_path):
     assert job_of(tmp_path, loaded.text).job == loaded.job
     tasks = BodiesStage().plan(loaded.job, JobLayout(tmp_path))
     assert len(tasks) == 1 + len({body.scale for body in loaded.job.rigid[1:]})
+
+
+def test_meshes_that_no_memory_holds_are_refused_with_their_number_and_a_group_of_them_is_not(tmp_path):
+    (tmp_path / "stone.obj").write_text(TETRAHEDRON)
+    stone = (
+        '[[rigid]]\nname = "stone{}"\nshape = {{ type = "mesh", file = "stone.obj", size = 0.1 }}\n'
+        "position = [0.0, 0.0, {}]\n"
+    )
+    room = 2.5 * 4 * TRIANGLE_BYTES  # two tetrahedra and a half
+    each = "".join(stone.format(number, 0.2 * number) for number in range(1, 5))
+    findings = Findings()
+    solids = build_solids(placements(job_of(tmp_path, ROOM + each).job), findings, room_bytes=room)
+    (problem,) = findings.errors
+    assert problem.path == ("rigid", 2, "shape") and len(solids) == 3
+    assert "the first 3 meshes have 12 triangles" in problem.message
+    group = stone.format("", 0.2) + "count = 4\nspacing = 0.2\n"
+    findings = Findings()
+    build_solids(placements(job_of(tmp_path, ROOM + group).job), findings, room_bytes=room)
+    assert not findings.errors
 
 
 def test_a_thousand_bodies_are_one_mesh_and_four_arrays(tmp_path):

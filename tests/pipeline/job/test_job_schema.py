@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -64,11 +65,18 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
-    example, pouring, joints, cloth, smoke, limits = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    example, many, pouring, joints, cloth, smoke, limits = re.findall(r"```toml
+(.*?)```", document, re.DOTALL)
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")
     assert load_job(tmp_path / "limited.toml").limits_of("render").attempts == 5
+    (tmp_path / "many.toml").write_text(f'name = "many"\n{many}')
+    assert Counter(body.group for body in load_job(tmp_path / "many.toml").rigid) == {
+        "brick": 40,
+        "domino": 40,
+        "stone": 200,
+    }
     jug = '[[rigid]]\nname = "jug"\nkind = "kinematic"\nshape = { type = "capsule", radius = 0.035, height = 0.11 }\n'
     poured = example.replace("[[rigid]]", f"{pouring}\n{jug}\n[[rigid]]", 1)
     (tmp_path / "poured.toml").write_text(poured)
