@@ -65,8 +65,7 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
-    example, many, pouring, joints, cloth, smoke, limits = re.findall(r"```toml
-(.*?)```", document, re.DOTALL)
+    example, many, pouring, joints, cloth, smoke, limits = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import taichi as ti
 import trimesh
 from rigid_scenes import ball, body, cube
 
 from sim.core.motion import rotation
-from sim.rigid.contact_solver import tangent_basis
+from sim.rigid.contact_kernels import tangents_of
 from sim.shapes.body_geometry import BodyGeometry
 
 
@@ -79,10 +80,18 @@ def test_corner_balls_of_a_box_touch_all_three_faces():
     np.testing.assert_allclose(to_faces[corners], np.repeat(radii[corners, None], 3, axis=1), rtol=1e-8)
 
 
-def test_tangents_are_orthonormal_to_the_normal():
-    normals = np.random.default_rng(1).normal(size=(50, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    axes = np.concatenate([normals[:, None], tangent_basis(normals)], axis=1)
+@ti.kernel
+def add_tangents(axes: ti.types.ndarray(dtype=ti.f64, ndim=3)):
+    for k in range(axes.shape[0]):
+        one, two = tangents_of(ti.Vector([axes[k, 0, 0], axes[k, 0, 1], axes[k, 0, 2]]))
+        for i in ti.static(range(3)):
+            axes[k, 1, i], axes[k, 2, i] = one[i], two[i]
+
+
+def test_tangents_are_orthonormal_to_the_normal(taichi_cpu):
+    axes = np.random.default_rng(1).normal(size=(50, 3, 3))
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    add_tangents(axes)
     np.testing.assert_allclose(np.einsum("kia,kja->kij", axes, axes), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12)
 
 
