@@ -117,10 +117,11 @@ def described(solver: RigidSolver) -> dict[str, float]:
     """How deep bodies are in each other and in walls [mm], and how fast they are [m/s]."""
     from sim.rigid.collision import CollisionDetector
 
-    count = len(solver.bodies)
+    count = len(solver.all_geometries)
+    moves = np.arange(count) < len(solver.bodies)
     detector = CollisionDetector(solver.all_geometries, solver.walls)
     nothing = np.zeros(0, dtype=np.int64)
-    found = detector.find(solver.poses(), np.zeros(count + 1), nothing, np.ones(count, dtype=bool))
+    found = detector.find(solver.poses(), np.zeros(count + 1), nothing, moves)
     depth = np.maximum(-found.gap, 0.0)
     speed = np.sqrt(np.square(solver.bodies.velocity).sum(axis=1))
     return {
@@ -136,7 +137,7 @@ def measure_blender(parameters: SceneParameters, frames: int, file: Path) -> dic
     from sim.build import build_world
     from sim.rigid.solver import RigidSolver
 
-    file.write_text(parameters.model_dump_json())
+    file.write_text(parameters.model_dump_json(exclude_unset=True))
     answer = child(["-m", "benchmarks.rigid", "--as-blender", str(file), "--frames", str(frames)])
     world = build_world(parameters, frames_per_second=FRAMES_PER_SECOND)
     solver = next(each for each in world.solvers.values() if isinstance(each, RigidSolver))

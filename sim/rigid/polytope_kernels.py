@@ -36,7 +36,7 @@ FIRST_VERTEX, VERTICES, FIRST_FACE, FACES = range(4)
 MOST_STEPS = 40  # of the search for the distance
 CONVERGED = 1.0e-13  # of the square of the distance: by how much its bounds still differ
 OVERLAP = 1.0e-14  # square of a distance, in that of the centres, below which sharp polytopes overlap
-FLUSH = 1.0 - 5.0e-7  # cosine of the angle to a face's normal from which on its contacts stand for the nearest points
+SAME_GAP = 1.0e-6  # of the radius: gaps that differ by less are those of one point
 VERTEX_BITS = 10
 NEAREST = ((1 << (FEATURE_BITS - WALL_BITS - VERTEX_BITS - 1)) - 1) << (VERTEX_BITS + 1)
 """Feature of the nearest points of two polytopes; others are vertices, or cut by the edge of a face."""
@@ -311,23 +311,33 @@ def candidates_of_pair(
             if one > two:
                 normal = -behind_first
         own_face, cosine_of_first = nearest_face(-normal, first, bodies, polytopes)
-        face, cosine = nearest_face(normal, second, bodies, polytopes)
+        face, cosine_of_second = nearest_face(normal, second, bodies, polytopes)
         side, own, other = 0, first, second  # whose corners meet the other's face
-        if cosine_of_first > cosine + 1.0e-6:
+        if cosine_of_first > cosine_of_second + 1.0e-6:
             side, own, other = 1, second, first
-            own_face, face, cosine = face, own_face, cosine_of_first
+            face = own_face
         outward = vector_at(polytopes.planes, face, 0)
         own_face, _ = nearest_face(-turned(bodies.pose, other, outward), own, bodies, polytopes)
         own_radius, other_radius = polytopes.radii[bodies.shape[own]], polytopes.radii[bodies.shape[other]]
         there, count = clip_faces(begin, room, own, other, own_face, face, bodies, polytopes, work)
+        least = ti.cast(FAR, ti.f64)
         for corner in range(there, there + count):
             centre = vector_at(work, corner, 0)
             before = outward.dot(centre) - polytopes.planes[face, 3] - other_radius
+            least = ti.min(least, before - own_radius)
             if before - own_radius <= margin:
                 feature = ti.cast(work[corner, 3], ti.i32)
                 add_candidate(end, side, other, feature, own_radius, centre, outward, before, bodies, work)
                 end += 1
-        if not overlaps and cosine < FLUSH:
+        gap = distance - radius - radius_of_second
+        if overlaps and end == begin:
+            # What is deepest lies beside the face.
+            centre = farthest(-turned(bodies.pose, other, outward), own, bodies, polytopes)
+            centre = turned_back(bodies.pose, other, centre - vector_at(bodies.pose, other, 0))
+            before = outward.dot(centre) - polytopes.planes[face, 3] - other_radius
+            add_candidate(end, side, other, NEAREST, own_radius, centre, outward, before, bodies, work)
+            end += 1
+        elif not overlaps and gap < least - SAME_GAP * radius:
             centre = turned_back(bodies.pose, second, point + way - vector_at(bodies.pose, second, 0))
             outward = turned_back(bodies.pose, second, normal)
             add_candidate(end, 0, second, NEAREST, radius, centre, outward, distance - radius_of_second, bodies, work)

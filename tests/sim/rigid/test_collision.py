@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 from rigid_scenes import ball, body, cube, in_room, in_space
+from scipy.optimize import nnls
 
 from sim.core.domain import DomainParameters
 from sim.rigid.broad_phase import overlapping_pairs
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Contacts
+from sim.rigid.polytopes import polytope_of
 from sim.rigid.solver import RigidSolver
 
 PROBE = 0.01
@@ -125,3 +127,41 @@ def test_the_broad_phase_finds_what_comparing_all_pairs_finds(floor):
     overlap = np.all(np.abs(centre[one] - centre[two]) <= half[one] + half[two], axis=1)
     wanted = overlap & (is_active[one] | is_active[two])
     np.testing.assert_array_equal(np.stack([first, second]), np.stack([one[wanted], two[wanted]]))
+
+
+def test_boxes_and_convex_meshes_are_as_far_apart_as_their_nearest_points(tmp_path):
+    """Beside a least-squares solution for the weights of both bodies' vertices, for pairs turned at random."""
+    random, path = np.random.default_rng(0), tmp_path / "stone.ply"
+    points = np.random.default_rng(3).normal(size=(40, 3))
+    trimesh.convex.convex_hull(points * [0.05] / np.linalg.norm(points, axis=1, keepdims=True)).export(path)
+    shapes = [cube(0.1), {"type": "mesh", "file": str(path)}]
+    overlapping = 0
+    for trial in range(60):
+        apart, turns = random.normal(size=3), random.uniform(-180, 180, (2, 3))
+        apart *= random.uniform(0.07, 0.13) / np.linalg.norm(apart)
+        kinds = shapes[trial % 2], shapes[trial // 2 % 2]
+        places = (np.zeros(3), apart)
+        solver = in_space(
+            *(
+                body(f"b{k}", kinds[k], tuple(places[k]), rotation_deg=tuple(turns[k]), kind="kinematic")
+                for k in range(2)
+            )
+        )
+        found, poses = contacts_of(solver, 0.1), solver.poses()
+        polytopes = [polytope_of(geometry) for geometry in solver.solids]
+        one, two = (
+            poses.position[k] + polytopes[k].vertices @ poses.rotation[k].T
+            for k in range(2)
+            if polytopes[k] is not None
+        )
+        sums = np.zeros((2, len(one) + len(two)))
+        sums[0, : len(one)] = sums[1, len(one) :] = 1e3
+        weights, _ = nnls(np.vstack([np.hstack([one.T, -two.T]), sums]), np.array([0.0, 0.0, 0.0, 1e3, 1e3]))
+        distance = np.linalg.norm(weights[: len(one)] @ one - weights[len(one) :] @ two)
+        rounded = polytopes[0].radius + polytopes[1].radius
+        if distance < 1e-6:
+            overlapping += 1
+            assert found.gap.min() < -rounded
+        else:
+            assert found.gap.min() == pytest.approx(distance - rounded, abs=1e-6)
+    assert 0 < overlapping < 60
