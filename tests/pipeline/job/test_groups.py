@@ -177,7 +177,7 @@ def test_a_thousand_bodies_are_one_mesh_and_four_arrays(tmp_path):
     (frame, *_) = RenderStage().plan(loaded.job, layout)
     assert len([each for each in frame.inputs if each.startswith("meshes/")]) == 2
     assert len({drawn.file for drawn in scene_objects(loaded.job, layout)}) == 2
-    scene = Scene(loaded, threads=1)
+    scene = Scene(loaded)
     scene.write(tmp_path / "frame.h5")
     validate_frame(tmp_path / "frame.h5")
     with h5py.File(tmp_path / "frame.h5") as file:
@@ -191,7 +191,7 @@ def test_a_thousand_bodies_are_one_mesh_and_four_arrays(tmp_path):
 
 
 def test_what_is_read_of_a_frame_is_what_was_written(tmp_path):
-    scene = Scene(job_of(tmp_path, ROOM + BRICKS + BALL), threads=1)
+    scene = Scene(job_of(tmp_path, ROOM + BRICKS + BALL))
     scene.step()
     scene.write(tmp_path / "frame.h5")
     written, read = scene.bodies(), read_frame(tmp_path / "frame.h5").bodies
@@ -209,7 +209,7 @@ def test_what_is_read_of_a_frame_is_what_was_written(tmp_path):
 
 
 def test_the_library_takes_the_name_of_a_group(tmp_path):
-    scene = Scene(job_of(tmp_path, ROOM + BRICKS.replace("0.02]", "0.3]") + BALL), threads=1)
+    scene = Scene(job_of(tmp_path, ROOM + BRICKS.replace("0.02]", "0.3]") + BALL))
     assert scene.view("brick")["position"].shape == (12, 3)
     scene.add_force("brick", (1.0, 0.0, 0.0))
     scene.step()
@@ -224,7 +224,7 @@ def test_live_parameters_of_a_group_are_those_of_all_its_bodies(tmp_path):
     parameters = {each.name: each for each in parameters_of(loaded.job)}
     density, friction = parameters["rigid.brick.density"], parameters["rigid.brick.friction"]
     assert density.paths == (("rigid", 1, "density"),)
-    scene = Scene(loaded, threads=1)
+    scene = Scene(loaded)
     solver = scene.world.solvers["rigid"]
     mass = solver.bodies.mass.copy()
     set_parameter(scene.world, loaded.job, density, 900.0, before=1800.0)
