@@ -56,8 +56,9 @@ class RigidSolver:
     of bodies that nothing else holds.
 
     Approximate: boxes and convex meshes touch each other and walls as rounded polytopes (`polytopes`), other shapes as
-    unions of balls (`balls.Balls`); both round sharp corners by 2 % of the shortest edge; friction has one coefficient for sticking and sliding; moving overlapping bodies apart, where they do not
-    bounce, changes the angular momentum of the pair by some 1e-5 of itself. Restitution is Newton's, of normal
+    unions of balls (`balls.Balls`); both round sharp corners by 2 % of the shortest edge; friction
+    has one coefficient for sticking and sliding; moving overlapping bodies apart, where they do not bounce, changes
+    the angular momentum of the pair by some 1e-5 of itself. Restitution is Newton's, of normal
     velocities, where Stronge's, of energy, allows it (`restitution`): impulses never add energy. Bringing corners to
     where their bounce leads within a step may lift a body: up to 0.3 % of its energy at a restitution of 1, to first
     order in the step. Unsupported: rolling friction. Joints: `joints.Joints`.
