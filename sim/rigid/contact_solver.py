@@ -131,7 +131,8 @@ def solve_velocities(
     from sim.rigid.joint_kernels import IMPULSE
 
     k = len(least_normal)
-    order = np.argsort(system.islands, kind="stable").astype(np.int32)
+    # By chance, but always the same: along rows of bodies sweeps carry what they leave to one side.
+    order = np.lexsort((np.random.PCG64(0).random_raw(k), system.islands)).astype(np.int32)
     sizes = np.bincount(system.islands)
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
     most = np.full(len(sizes), MAX_ITERATIONS, dtype=np.int32) if most is None else most

@@ -37,6 +37,7 @@ MOST_STEPS = 40  # of the search for the distance
 CONVERGED = 1.0e-13  # of the square of the distance: by how much its bounds still differ
 OVERLAP = 1.0e-14  # square of a distance, in that of the centres, below which sharp polytopes overlap
 SAME_GAP = 1.0e-6  # of the radius: gaps that differ by less are those of one point
+FLUSH = 1.0e-2  # of the radius: corners that are less far beyond an edge are not cut off
 VERTEX_BITS = 10
 NEAREST = ((1 << (FEATURE_BITS - WALL_BITS - VERTEX_BITS - 1)) - 1) << (VERTEX_BITS + 1)
 """Feature of the nearest points of two polytopes; others are vertices, or cut by the edge of a face."""
@@ -258,6 +259,7 @@ def clip_faces(
         following = polytopes.corners[begin_of_corners + (side + 1) % sides]
         start = vector_at(polytopes.vertices, first_there + before, 0)
         inward = normal.cross(vector_at(polytopes.vertices, first_there + following, 0) - start)
+        slack = FLUSH * polytopes.radii[bodies.shape[other]] * inward.norm()
         edge = begin_of_corners - first_corner_of_body + side
         source, there = there, begin + room + ti.select(there == begin + room, room, 0)
         left = 0
@@ -265,16 +267,16 @@ def clip_faces(
             here, after = source + corner, source + (corner + 1) % count
             depth = inward.dot(vector_at(work, here, 0) - start)
             depth_after = inward.dot(vector_at(work, after, 0) - start)
-            if depth >= 0.0:
+            if depth >= -slack:
                 for column in ti.static(range(4)):
                     work[there + left, column] = work[here, column]
                 left += 1
-            if (depth >= 0.0) != (depth_after >= 0.0):
-                share = depth / (depth - depth_after)
+            if (depth >= -slack) != (depth_after >= -slack):
+                share = ti.math.clamp(depth / (depth - depth_after), 0.0, 1.0)
                 for axis in ti.static(range(3)):
                     work[there + left, axis] = work[here, axis] + share * (work[after, axis] - work[here, axis])
                 vertex = ti.cast(work[here, 3], ti.i32) & ((1 << VERTEX_BITS) - 1)
-                leaves = ti.select(depth >= 0.0, 1, 0)
+                leaves = ti.select(depth >= -slack, 1, 0)
                 work[there + left, 3] = ((1 + edge) << (VERTEX_BITS + 1)) + (leaves << VERTEX_BITS) + vertex
                 left += 1
         count = left
