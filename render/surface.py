@@ -3,8 +3,8 @@
 The density of the particles is sampled on a grid and contoured by marching cubes, the contour's slivers are collapsed
 (Moore & Warren 1992), and a Laplacian smoothing that spares isolated droplets removes the particles' bumps (Löschner,
 Böttcher, Jeske & Bender 2023, "Weighted Laplacian Smoothing for Surface Reconstruction of Particle-based Fluids").
-splashsurf does the work. Before it, thin sheets and threads get further samples (`render.sheets`); after it, the
-surface is moved along its normals until it encloses as much as the particles stand for.
+splashsurf does the work. Before it, thin sheets and threads get further samples (`render.sheets`), and films on walls
+(`render.walls`); after it, the surface is moved along its normals until it encloses as much as the particles stand for.
 """
 
 from __future__ import annotations
@@ -19,12 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 from render.meshes import SurfaceMesh
 from render.parameters import SurfaceParameters
 from render.sheets import samples_between
+from render.walls import MIRRORED_IN_SPACINGS, Walls, films, folded_onto, mirrored, planes_of_surface
 
 LARGEST_SHIFT_IN_RADII = 0.6
 """How far a surface is moved at most, so that no thin part is turned inside out."""
 _ROUNDS = 8
 _FITTED = 1e-4
 """Share of the volume that may be lacking in the end [-]."""
+_WORTH_A_ROUND = 0.1 * _FITTED
+"""What moving by the largest shift has to give, as a share of the volume [-]."""
 
 
 class SurfaceReconstructionError(Exception):
@@ -39,6 +42,7 @@ def reconstruct_surface(
     parameters: SurfaceParameters,
     is_thin: NDArray[np.bool_] | None = None,
     volume: float | None = None,
+    walls: Walls | None = None,
     threads: int = 1,
 ) -> SurfaceMesh:
     """Mesh the surface of a fluid.
@@ -53,6 +57,7 @@ def reconstruct_surface(
         parameters: how the particles become a surface.
         is_thin: which particles lie in sheets and threads, (n,); none if omitted.
         volume: that the surface is to enclose [m³]; as it comes if omitted. See `with_volume`.
+        walls: that the fluid wets; none if omitted.
         threads: how many threads to use; fixed by the first call in a process.
 
     Returns:
@@ -70,16 +75,26 @@ def reconstruct_surface(
         nothing = np.empty((0, 3), np.float32)
         return SurfaceMesh(nothing, np.empty((0, 3), np.int32), nothing, nothing)
     thin = np.zeros(len(position_rows), bool) if is_thin is None else is_thin
-    between = np.flatnonzero(thin)[samples_between(position_rows[thin], 2.0 * particle_radius)]
+    walls, spacing = walls or Walls.nowhere(), 2.0 * particle_radius
+    film = films(position_rows, velocity_rows, walls, spacing=spacing)
+    own, thin = ~film.replaces, thin & ~film.replaces
+    between = np.flatnonzero(thin)[samples_between(position_rows[thin], spacing)]
     samples, sample_velocities, thinness = (
-        np.concatenate([rows, rows[between].mean(axis=1, dtype=np.float32)])
-        for rows in (position_rows, velocity_rows, thin.astype(np.float32))
+        np.concatenate([rows[own], rows[between].mean(axis=1, dtype=np.float32), of_film])
+        for rows, of_film in (
+            (position_rows, film.position),
+            (velocity_rows, film.velocity),
+            (thin.astype(np.float32), np.ones(len(film.position), np.float32)),
+        )
+    )
+    samples, sample_velocities, source = mirrored(
+        samples, sample_velocities, walls, reach=MIRRORED_IN_SPACINGS * spacing
     )
     splashsurf = _with_thread_pool(threads)
     try:
         reconstructed, _ = splashsurf.reconstruction_pipeline(
             samples,
-            attributes_to_interpolate={"velocity": sample_velocities, "thinness": thinness},
+            attributes_to_interpolate={"velocity": sample_velocities, "thinness": thinness[source]},
             particle_radius=particle_radius,
             multi_threading=threads > 1,
             **pipeline_options(parameters),
@@ -93,52 +108,53 @@ def reconstruct_surface(
         normals=np.array(attributes["normals"], np.float32),
         velocities=np.array(attributes["velocity"], np.float32),
     )
+    planes = planes_of_surface(walls, particle_radius=particle_radius)
+    mesh, kept = folded_onto(mesh, planes)
     if volume is not None:
-        mesh = with_volume(mesh, volume, attributes["thinness"], particle_radius=particle_radius)
+        mesh = with_volume(mesh, volume, attributes["thinness"][kept], planes=planes, particle_radius=particle_radius)
     return without_collapsed_parts(mesh)
 
 
-def with_volume(mesh: SurfaceMesh, volume: float, thinness: NDArray[Any], *, particle_radius: float) -> SurfaceMesh:
+def with_volume(
+    mesh: SurfaceMesh, volume: float, thinness: NDArray[Any], *, planes: Walls, particle_radius: float
+) -> SurfaceMesh:
     """Move a closed surface along its normals until it encloses a volume [m³], as far as that goes.
 
     Contour and smoothing take most from what is thin or curved: sheets and threads, (n,) between 0 and 1 at the
     vertices, are moved first, and the rest only by what is lacking then. No vertex moves farther than
-    `LARGEST_SHIFT_IN_RADII`, and none without a normal.
+    `LARGEST_SHIFT_IN_RADII`, and none without a normal; those on planes stay on them, and none passes one.
     """
     if not len(mesh.faces):
         return mesh
     assert mesh.normals is not None
     corners, directions = mesh.vertices.astype(np.float64), np.nan_to_num(mesh.normals.astype(np.float64))
+    directions[(corners <= planes.low) | (corners >= planes.high)] = 0.0
     largest = LARGEST_SHIFT_IN_RADII * particle_radius
     shift = np.zeros(len(corners))
     for weights in (np.clip(np.nan_to_num(thinness), 0.0, 1.0).astype(np.float64), np.ones(len(corners))):
         for _ in range(_ROUNDS):
-            moved = corners + shift[:, None] * directions
+            moved = np.clip(corners + shift[:, None] * directions, planes.low, planes.high)
             areas = _area_vectors(moved, mesh.faces)
             lacking = volume - np.einsum("ij,ij->", moved[mesh.faces[:, 0]], areas) / 3.0
             if abs(lacking) <= _FITTED * volume:
                 break
             # d(volume) = sum over vertices of a third of the areas around it . its direction
-            around = np.stack(
-                [
-                    np.bincount(mesh.faces.reshape(-1), np.repeat(column, 3), minlength=len(corners))
-                    for column in areas.T
-                ],
-                axis=1,
-            )
-            gain = np.einsum("ij,ij->i", around, directions) / 3.0
+            along = np.stack([np.einsum("ij,ij->i", areas, directions[ends]) for ends in mesh.faces.T], axis=1)
+            gain = np.bincount(mesh.faces.reshape(-1), along.reshape(-1), minlength=len(corners)) / 3.0
             movable = weights * ((shift < largest) if lacking > 0.0 else (shift > -largest))
             total = float(movable @ gain)
-            if total <= 0.0:
+            if total * largest <= _WORTH_A_ROUND * volume:
                 break
             shift = np.clip(shift + lacking / total * movable, -largest, largest)
-    return replace(mesh, vertices=(corners + shift[:, None] * directions).astype(np.float32))
+    moved = np.clip(corners + shift[:, None] * directions, planes.low, planes.high)
+    return replace(mesh, vertices=moved.astype(np.float32))
 
 
 def _area_vectors(corners: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     """Area of each triangle times its normal [m²], (m, 3)."""
-    a, b, c = (corners[faces[:, corner]] for corner in range(3))
-    return np.asarray(0.5 * np.cross(b - a, c - a))
+    a, b, c = (corners[ends] for ends in faces.T)
+    (x, y, z), (u, v, w) = np.ascontiguousarray((b - a).T), np.ascontiguousarray((c - a).T)
+    return np.asarray(0.5 * np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1))
 
 
 def without_collapsed_parts(mesh: SurfaceMesh) -> SurfaceMesh:

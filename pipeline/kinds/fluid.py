@@ -7,6 +7,8 @@ from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from blender_scripts.look_table import LOOK_TABLE
 from blender_scripts.optics import INSIDES, dye_per_metre, per_metre, through_ball
 from pipeline.base.content import tool_version
@@ -27,6 +29,8 @@ from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
 from render.surface import reconstruct_surface
+from render.walls import Walls
+from sim.core.domain import DomainParameters
 from sim.core.snapshots import Snapshot
 from sim.fluid.parameters import FluidParameters
 from sim.shapes.parameters import Placement
@@ -34,7 +38,6 @@ from sim.whitewater.kinds import LiquidKind, mean_diameter
 
 if TYPE_CHECKING:
     import h5py
-    import numpy as np
     from numpy.typing import NDArray
 
 WETS_WITHIN_RADII = 1.5
@@ -143,7 +146,8 @@ def _surface_tools(_job: Job) -> dict[str, str]:
 
 
 def _surface_parameters(job: Job) -> dict[str, Any]:
-    return {"surface": job.surface.model_dump(mode="json", exclude={"drop_diameter", "drops_per_particle"})}
+    surface = job.surface.model_dump(mode="json", exclude={"drop_diameter", "drops_per_particle"})
+    return {"surface": surface, "domain": job.domain}
 
 
 def _surface_memory(job: Job, fluid: FluidParameters) -> int:
@@ -152,6 +156,12 @@ def _surface_memory(job: Job, fluid: FluidParameters) -> int:
     finer = CUBE_SIZE / job.surface.cube_size_in_radii
     meshing: int = ceil(BYTES_PER_SURFACE_PARTICLE * on_surface * finer**2)
     return WORKER_BYTES + meshing
+
+
+def wetted_walls(domain: DomainParameters) -> Walls:
+    """The walls of a domain that liquids wet: all of its faces but the open ones."""
+    is_open = np.array([[f"{axis}{side}" in domain.open_faces for axis in "xyz"] for side in "-+"])
+    return Walls(np.where(is_open[0], -np.inf, domain.min), np.where(is_open[1], np.inf, domain.max))
 
 
 def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
@@ -163,6 +173,7 @@ def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
         particle_radius=radius,
         parameters=job.surface,
         is_thin=fluid.arrays["liquid"][meshed] == LiquidKind.SHEET,
+        walls=wetted_walls(job.domain),
         volume=len(meshed) * (2.0 * radius) ** 3 - fluid.number("volume_of_drops"),
         threads=threads,
     )
@@ -183,7 +194,7 @@ def _facts(fluid: FluidParameters, count: float | None) -> str:
 SURFACE = Product(
     stage="surface",
     about="surfaces of fluids",
-    version=4,
+    version=5,
     folder="surfaces",
     suffix=".ply",
     tools=_surface_tools,

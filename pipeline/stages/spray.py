@@ -16,13 +16,14 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.kinds.base import Work
 from pipeline.kinds.elements import most_particles
-from pipeline.kinds.fluid import FLUID
+from pipeline.kinds.fluid import FLUID, wetted_walls
 from pipeline.model.job import Job
 from pipeline.stages.base import FILE_S, FileWork, Stage, TaskContext
 from pipeline.stages.inputs import by_content
 from pipeline.stages.obstacles import moving_obstacles, read_fluids_and_bodies
 from pipeline.store.cache import read_frame, validate_frame, write_frame
 from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
+from render.walls import in_films
 from sim.core.runtime import initialize
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
@@ -57,7 +58,7 @@ class SprayStage(Stage):
 
     name = "spray"
     about = "drops of fluids"
-    version = 3
+    version = 4
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame of each fluid."""
@@ -159,6 +160,8 @@ def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot], solids: Obstacl
     breaks_up = job.surface.drops_per_particle > 0 and atomizes(
         viscosity=said.viscosity, rest_density=said.rest_density, particle_radius=particle_radius
     )
+    lies = lie_on(solids, fluid, particle_radius=particle_radius, frame_dt=1.0 / job.fps)
+    lies |= in_films(fluid.position, wetted_walls(job.domain), spacing=2.0 * particle_radius)
     return next_liquid(
         before,
         FluidState.of_snapshots([bodies[each.name] for each in job.fluid]),
@@ -166,7 +169,7 @@ def _kinds(context: TaskContext, bodies: Mapping[str, Snapshot], solids: Obstacl
         particle_radius=particle_radius,
         frame_dt=1.0 / job.fps,
         atomizes=breaks_up,
-        lies=lie_on(solids, fluid, particle_radius=particle_radius, frame_dt=1.0 / job.fps),
+        lies=lies,
     )
 
 
