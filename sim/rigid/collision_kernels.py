@@ -340,6 +340,45 @@ def keep_few(
     found.counts[task] = kept
 
 
+@func
+def beside_wall(centre: Vector3, wall: ti.i32, walls: Rows):
+    """Whether a point in the world has a wall before or behind it, the wall's normal, and how far it is before it."""
+    axis, is_beside, column = ti.cast(walls[wall, 0], ti.i32), True, 0
+    outward, distance = Vector3(0.0), ti.cast(0.0, ti.f64)
+    for i in ti.static(range(3)):
+        if i == axis:
+            distance = walls[wall, 1] * (centre[i] - walls[wall, 2])
+            outward[i] = walls[wall, 1]
+        else:
+            if centre[i] < walls[wall, 3 + column] or centre[i] > walls[wall, 5 + column]:
+                is_beside = False
+            column += 1
+    return is_beside, outward, distance
+
+
+@func
+def add_candidate(
+    end: ti.i32,
+    side: ti.i32,
+    other: ti.i32,
+    feature: ti.i32,
+    radius: ti.f64,
+    centre: Vector3,
+    outward: Vector3,
+    distance: ti.f64,
+    bodies: Bodies,
+    work: Rows,
+):
+    """Note a ball of a body near the other: its centre, the surface's normal and its distance, in the other's frame."""
+    normal = turned(bodies.pose, other, outward)
+    point = turned(bodies.pose, other, centre - radius * outward) + vector_at(bodies.pose, other, 0)
+    for i in ti.static(range(3)):
+        work[end, i], work[end, 3 + i], work[end, 8 + i] = centre[i], outward[i], point[i]
+        work[end, 11 + i] = ti.select(side == 0, normal[i], -normal[i])
+    work[end, 6], work[end, 7], work[end, 14] = distance, radius, distance - radius
+    work[end, 15], work[end, 16], work[end, 17] = side, feature, FREE
+
+
 @kernel_of_host_arrays
 def find_contacts(
     tasks: Tasks,
@@ -413,16 +452,7 @@ def find_contacts(
                         )
                         outward, distance, touches = Vector3(0.0), ti.cast(0.0, ti.f64), False
                         if wall >= 0:
-                            axis, is_beside = ti.cast(walls[wall, 0], ti.i32), True
-                            column = 0
-                            for i in ti.static(range(3)):
-                                if i == axis:
-                                    distance = walls[wall, 1] * (centre[i] - walls[wall, 2])
-                                    outward[i] = walls[wall, 1]
-                                else:
-                                    if centre[i] < walls[wall, 3 + column] or centre[i] > walls[wall, 5 + column]:
-                                        is_beside = False
-                                    column += 1
+                            is_beside, outward, distance = beside_wall(centre, wall, walls)
                             touches = is_beside and distance <= margin + radius
                         else:
                             against = bodies.shape[other]
@@ -436,19 +466,8 @@ def find_contacts(
                                     cosine = ti.max(-1.0, ti.min(-axis_there.dot(outward), 1.0))
                                     touches = ti.acos(cosine) <= shapes.balls[ball, 7] + shapes.sizes[against, SLANT]
                         if touches:
-                            in_world = outward
-                            point = centre - radius * outward
-                            if wall < 0:
-                                in_world = turned(bodies.pose, other, outward)
-                                point = turned(bodies.pose, other, point) + vector_at(bodies.pose, other, 0)
-                            for i in ti.static(range(3)):
-                                work[end, i] = centre[i]
-                                work[end, 3 + i] = outward[i]
-                                work[end, 8 + i] = point[i]
-                                work[end, 11 + i] = ti.select(side == 0, in_world[i], -in_world[i])
-                            work[end, 6], work[end, 7], work[end, 14] = distance, radius, distance - radius
-                            work[end, 15], work[end, 17] = side, FREE
-                            work[end, 16] = number + (ti.max(wall, 0) << (FEATURE_BITS - WALL_BITS))
+                            feature = number + (ti.max(wall, 0) << (FEATURE_BITS - WALL_BITS))
+                            add_candidate(end, side, other, feature, radius, centre, outward, distance, bodies, work)
                             end += 1
             keep_few(begin, end, task, first, second, margin, last, work, found)
             task += blocks

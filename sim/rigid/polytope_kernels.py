@@ -13,7 +13,6 @@ from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
 from sim.rigid.collision_kernels import (
     FAR,
-    FREE,
     MOST_KEPT,
     Bodies,
     Found,
@@ -24,6 +23,8 @@ from sim.rigid.collision_kernels import (
     Vector3,
     Whole,
     WholeRows,
+    add_candidate,
+    beside_wall,
     keep_few,
     turned,
     turned_back,
@@ -201,29 +202,6 @@ def nearest_points(first: ti.i32, second: ti.i32, within: ti.f64, bodies: Bodies
 
 
 @func
-def add_candidate(
-    end: ti.i32,
-    side: ti.i32,
-    other: ti.i32,
-    feature: ti.i32,
-    radius: ti.f64,
-    centre: Vector3,
-    outward: Vector3,
-    distance: ti.f64,
-    bodies: Bodies,
-    work: Rows,
-):
-    """Note a ball of a body near the other: its centre, the surface's normal and its distance, in the other's frame."""
-    normal = turned(bodies.pose, other, outward)
-    point = turned(bodies.pose, other, centre - radius * outward) + vector_at(bodies.pose, other, 0)
-    for i in ti.static(range(3)):
-        work[end, i], work[end, 3 + i], work[end, 8 + i] = centre[i], outward[i], point[i]
-        work[end, 11 + i] = ti.select(side == 0, normal[i], -normal[i])
-    work[end, 6], work[end, 7], work[end, 14] = distance, radius, distance - radius
-    work[end, 15], work[end, 16], work[end, 17] = side, feature, FREE
-
-
-@func
 def clip_faces(
     begin: ti.i32,
     room: ti.i32,
@@ -362,19 +340,10 @@ def candidates_at_wall(
     """Note which vertices of a polytope are near a wall, which belongs to the second body; returns the row after."""
     end, shape = begin, bodies.shape[first]
     radius, first_vertex = polytopes.radii[shape], polytopes.whole[shape, FIRST_VERTEX]
-    axis = ti.cast(walls[wall, 0], ti.i32)
     for vertex in range(polytopes.whole[shape, VERTICES]):
         centre = turned(bodies.pose, first, vector_at(polytopes.vertices, first_vertex + vertex, 0))
         centre += vector_at(bodies.pose, first, 0)
-        outward, distance, is_beside, column = Vector3(0.0), ti.cast(0.0, ti.f64), True, 0
-        for i in ti.static(range(3)):
-            if i == axis:
-                distance = walls[wall, 1] * (centre[i] - walls[wall, 2])
-                outward[i] = walls[wall, 1]
-            else:
-                if centre[i] < walls[wall, 3 + column] or centre[i] > walls[wall, 5 + column]:
-                    is_beside = False
-                column += 1
+        is_beside, outward, distance = beside_wall(centre, wall, walls)
         if is_beside and distance - radius <= margin:
             feature = vertex + (wall << (FEATURE_BITS - WALL_BITS))
             add_candidate(end, 0, second, feature, radius, centre, outward, distance, bodies, work)
