@@ -221,7 +221,10 @@ def placed_on(emitter: EmitterParameters, body: Placement) -> EmitterParameters:
     """The emitter where it is in the world with a body that stands still."""
     turned, own = rotation.from_degrees(body.rotation_deg), rotation.from_degrees(emitter.rotation_deg)
     position = np.asarray(body.position) + rotation.rotated(turned, np.asarray(emitter.position))
-    update = {"position": tuple(position.tolist()), "rotation_deg": rotation.to_degrees(rotation.product(turned, own))}
+    update = {
+        "position": tuple(position.tolist()),
+        "rotation_deg": tuple(rotation.to_degrees(rotation.product(turned, own)).tolist()),
+    }
     return emitter.model_copy(update={**update, "follow": None})
 
 

@@ -58,7 +58,7 @@ def _members(table: RigidBodyParameters, number: int, scattered: _Taken) -> Iter
         raise KeyRefusedError((number, "name"), f'is too long for bodies named up to "{table.name}_{count}"')
     scales = _scales(table, count)
     places, yaws = _places(table, number, scales, scattered)
-    turned = _turned_by(np.array([table.rotation_deg]))[0]
+    turned = rotation.from_degrees(table.rotation_deg)
     if any(table.rotation_deg):
         places = np.round(rotation.rotated(turned, places), _PLACE_DIGITS)
     places = places + np.array(table.position)
@@ -91,36 +91,19 @@ def _scales(table: RigidBodyParameters, count: int) -> list[float]:
 
 def _turns(table: RigidBodyParameters, yaws: Array | None, turned: Array, count: int) -> list[Vector3]:
     """Rotation of each body about x, then y, then z [degrees]."""
-    own = [] if yaws is None else [_turned_by(yaws[:, None] * np.array([0.0, 0.0, 1.0]))]
+    own = [] if yaws is None else [rotation.from_degrees(yaws[:, None] * np.array([0.0, 0.0, 1.0]))]
     if table.scatter is not None and table.scatter.turned:
         own.append(_any_turns(_uniform(table, "turns", (count, 3))))
     if table.jitter is not None and any(table.jitter.rotation_deg):
         reach = np.array(table.jitter.rotation_deg)
-        own.append(_turned_by(reach * (2.0 * _uniform(table, "jitter of turns", (count, 3)) - 1.0)))
+        own.append(rotation.from_degrees(reach * (2.0 * _uniform(table, "jitter of turns", (count, 3)) - 1.0)))
     if not own:
         return [table.rotation_deg] * count
     whole = np.tile(turned, (count, 1))
     for each in own:
         whole = rotation.product(whole, each)
-    found = np.round(_degrees_of(rotation.matrices(rotation.normalized(whole))), _TURN_DIGITS) + 0.0
+    found = np.round(rotation.to_degrees(whole), _TURN_DIGITS) + 0.0
     return [(float(x), float(y), float(z)) for x, y, z in found]
-
-
-def _turned_by(angles: Array) -> Array:
-    """Unit quaternions of turns about x, then y, then z [degrees], (n, 3)."""
-    half = 0.5 * np.radians(angles)
-    about = np.zeros((3, len(angles), 4))
-    for axis in range(3):
-        about[axis, :, 0], about[axis, :, axis + 1] = np.cos(half[:, axis]), np.sin(half[:, axis])
-    return rotation.product(about[2], rotation.product(about[1], about[0]))
-
-
-def _degrees_of(matrices: Array) -> Array:
-    """Turns about x, then y, then z [degrees], (n, 3), that make rotation matrices (n, 3, 3)."""
-    y = np.arcsin(np.clip(-matrices[:, 2, 0], -1.0, 1.0))
-    x = np.arctan2(matrices[:, 2, 1], matrices[:, 2, 2])
-    z = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
-    return np.degrees(np.stack([x, y, z], axis=1))
 
 
 def _any_turns(chances: Array) -> Array:
@@ -267,7 +250,7 @@ def _scattered(
             (number, "shape", "size"),
             "is missing; what is scattered needs the longest edge of its mesh [m], by which it gets room",
         )
-    turn = _turned_by(np.array([table.rotation_deg]))[0]
+    turn = rotation.from_degrees(table.rotation_deg)
     origin = np.array(table.position)
     half = np.array(box_around(scatter.shape))
     stream, places = _stream(table, "places"), np.zeros((len(scales), 3))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -73,8 +73,8 @@ def from_matrix(rotation: Array) -> Array:
     return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
 
 
-def from_degrees(rotation_deg: tuple[float, float, float]) -> Array:
-    """Unit quaternion of rotations about the world's x, then y, then z [degrees]."""
+def from_degrees(rotation_deg: ArrayLike) -> Array:
+    """Unit quaternions of rotations about the world's x, then y, then z [degrees], (3,) or (n, 3)."""
     from scipy.spatial.transform import Rotation
 
     quaternion: Array = Rotation.from_euler("xyz", rotation_deg, degrees=True).as_quat(
@@ -83,12 +83,13 @@ def from_degrees(rotation_deg: tuple[float, float, float]) -> Array:
     return quaternion
 
 
-def to_degrees(q: Array) -> tuple[float, float, float]:
-    """Rotations about the world's x, then y, then z that make up a unit quaternion (4,) [degrees]."""
+def to_degrees(q: Array) -> Array:
+    """Rotations about the world's x, then y, then z that make up unit quaternions (4,) or (n, 4) [degrees]."""
     from scipy.spatial.transform import Rotation
 
-    x, y, z = Rotation.from_quat(q, scalar_first=True).as_euler("xyz", degrees=True).tolist()
-    return x, y, z
+    # At 90 degrees about y only the sum of the other two counts: z is 0 then.
+    found: Array = Rotation.from_quat(q, scalar_first=True).as_euler("xyz", degrees=True, suppress_warnings=True)
+    return found
 
 
 def exponential(vector: Array) -> Array:

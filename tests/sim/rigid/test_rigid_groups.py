@@ -51,6 +51,14 @@ def test_every_second_storey_is_shifted_and_the_whole_is_turned_with_its_bodies(
     assert {each.rotation_deg for each in turned} == {(0.0, 0.0, 30.0)}
 
 
+def test_bodies_that_stand_on_their_end_keep_their_turn_along_a_curve():
+    """At 90 degrees about y the angles about x and z are one."""
+    found = group(count=3, along={"points": [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]}, rotation_deg=(30.0, 90.0, 0.0))
+    wanted = from_degrees((30.0, 90.0, 0.0))
+    for each in found:
+        assert abs(from_degrees(each.rotation_deg) @ wanted) == pytest.approx(1.0, abs=1e-12)
+
+
 def test_one_count_is_a_row_by_a_number_or_by_a_way():
     assert places(group(count=3, spacing=0.2))[:, 0] == pytest.approx([0.0, 0.2, 0.4])
     stairs = places(group(count=3, spacing=(0.2, 0.0, 0.1)))
