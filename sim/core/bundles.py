@@ -26,11 +26,14 @@ from __future__ import annotations
 import ast
 import functools
 import inspect
+import textwrap
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import taichi as ti
 from taichi.lang import kernel_impl
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+from taichi.lang.exception import TaichiSyntaxError
 
 SEPARATOR = "__"  # between the names of a bundle and its field, in that of an argument
 
@@ -136,7 +139,20 @@ class _Fields:
 
 
 def _read_source(kernel: Any, *args: Any, **keywords: Any) -> tuple[ast.Module, Any]:
-    """As Taichi reads the source of a kernel, but with the fields of bundles as arguments."""
+    """As Taichi reads the source of a kernel or device function, but with the fields of bundles as arguments.
+
+    That of a function is read once, not for each call that kernels have of it, thousands in all.
+    """
+    if keywords.get("is_kernel") is False:
+        tree, place = _source_of(kernel.func)
+        return tree, ASTTransformerContext(
+            is_kernel=False,
+            func=kernel,
+            global_vars=kernel_impl._get_global_vars(kernel.func),
+            argument_data=keywords["args"],
+            ast_builder=keywords["ast_builder"],
+            **place,
+        )
     tree, context = _taichi_reads_source(kernel, *args, **keywords)
     kinds = getattr(kernel.func, "__bundles__", ())
     if kinds:
@@ -150,7 +166,27 @@ def _read_source(kernel: Any, *args: Any, **keywords: Any) -> tuple[ast.Module, 
     return tree, context
 
 
-_taichi_reads_source = kernel_impl._get_tree_and_ctx
-kernel_impl._get_tree_and_ctx = _read_source
-# Taichi finds the lines of a function in its file for each call that kernels have of it, thousands in all.
-kernel_impl.getsourcelines = functools.cache(kernel_impl.getsourcelines)
+@functools.cache
+def _source_of(function: Callable[..., Any]) -> tuple[ast.Module, dict[str, Any]]:
+    """Tree of a device function, and where it stands as contexts have it."""
+    lines, first = inspect.getsourcelines(function)
+    tree = ast.parse(textwrap.dedent("".join(lines)))
+    tree.body[0].decorator_list = []  # type: ignore[attr-defined]
+    return tree, {"file": inspect.getsourcefile(function), "src": lines, "start_lineno": first}
+
+
+def _trace(tree: ast.Module, context: Any) -> Any:
+    """As Taichi traces a kernel or a function, which writes into the tree. Raises TaichiSyntaxError where a function
+    calls itself."""
+    if tree in _traced:
+        raise TaichiSyntaxError(f"{context.func.func.__name__} calls itself; device functions cannot")
+    _traced.append(tree)
+    try:
+        return _taichi_traces(tree, context)
+    finally:
+        _traced.pop()
+
+
+_traced: list[ast.Module] = []  # the kernel that is traced, the function that it calls, and so on
+_taichi_reads_source, _taichi_traces = kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree
+kernel_impl._get_tree_and_ctx, kernel_impl.transform_tree = _read_source, _trace

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
-from scipy.stats import qmc
 
 from sim.core.solver import Coupling
 from sim.fluid.boundary import BodyStates
@@ -138,6 +137,8 @@ def completing_factors(
 
 def _share_inside(probes: NDArray[np.float64], signed_distance: SignedDistance, support: float) -> NDArray[np.float64]:
     """Integral of W over the inside of a body around each probe [-], (n,)."""
+    from scipy.stats import qmc  # takes longer to load than all the rest of a simulation without floating bodies
+
     # Points of low discrepancy: of a lattice whole layers would change sides where a face is parallel to it.
     cube = 2.0 * qmc.Sobol(3, seed=1).random_base2(QUADRATURE_BITS) - 1.0
     offsets = support * cube[np.linalg.norm(cube, axis=1) < 1.0]

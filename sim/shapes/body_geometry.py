@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.shapes.balls import Balls, exact_balls, surface_balls
+from sim.shapes.distance_grids import sampled_distances
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, mass_properties_of_solid
 from sim.shapes.mesh_solid import MeshSolid
@@ -99,6 +100,11 @@ class BodyGeometry:
         """Distances of a mesh as contacts read them, in the frame of `solid`."""
         longest = float(np.max(self.bounds[1] - self.bounds[0]))
         return LevelSet.sample(self.solid, longest / GRID_CELLS, padding=GRID_PADDING * longest)
+
+    @cached_property
+    def fine_grid(self) -> LevelSet:
+        """Distances of a mesh as cloth and smoke read them, in the frame of `solid`."""
+        return sampled_distances(self.solid)
 
 
 def _mass_properties(solid: PlacedSolid) -> MassProperties:

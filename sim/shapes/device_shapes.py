@@ -12,7 +12,6 @@ import taichi as ti
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.distance_grids import sampled_distances
 from sim.shapes.level_set import LevelSet
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 
@@ -155,7 +154,7 @@ class DeviceShapes:
                     radius[number] = size[number, 0] + np.linalg.norm(geometry.centre_of_mass)
                 continue
             if id(geometry) not in sampled:
-                level_set = sampled_distances(solid)
+                level_set = geometry.fine_grid
                 sampled[id(geometry)] = sum(each.size for each in values), level_set
                 values.append(level_set.values.ravel())
             first[number], level_set = sampled[id(geometry)]

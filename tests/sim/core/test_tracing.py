@@ -3,7 +3,7 @@
 import pytest
 import taichi as ti
 
-from sim.core.bundles import kernel_impl
+from sim.core.bundles import _source_of
 
 
 @ti.kernel
@@ -40,21 +40,62 @@ def test_an_error_on_a_later_line_shows_that_line(taichi_cpu):
 
 
 @ti.func
-def doubled(number: ti.f32) -> ti.f32:
-    return 2.0 * number
+def times(number: ti.f32, factor: ti.template()) -> ti.f32:
+    product = number
+    for _ in ti.static(range(factor - 1)):
+        product += number
+    return product
 
 
 @ti.kernel
-def eightfold(numbers: ti.types.ndarray(ti.f32, 1)):
+def thirtyfold(numbers: ti.types.ndarray(ti.f32, 1)):
     for i in range(numbers.shape[0]):
-        numbers[i] = doubled(doubled(doubled(numbers[i])))
+        numbers[i] = times(times(times(numbers[i], 2), 3), 5)
 
 
 def test_the_source_of_a_function_is_read_once_for_all_of_its_uses(taichi_cpu):
     numbers = ti.ndarray(ti.f32, 3)
     numbers.fill(1.5)
-    before = kernel_impl.getsourcelines.cache_info()
-    eightfold(numbers)
-    after = kernel_impl.getsourcelines.cache_info()
-    assert (after.misses - before.misses, after.hits - before.hits >= 2) == (2, True)
-    assert numbers.to_numpy().tolist() == [12.0] * 3
+    before = _source_of.cache_info()
+    thirtyfold(numbers)
+    after = _source_of.cache_info()
+    assert (after.misses - before.misses, after.hits - before.hits) == (1, 2)
+    assert numbers.to_numpy().tolist() == [45.0] * 3
+
+
+@ti.func
+def wrong_function(number: ti.f32) -> ti.f32:
+    return number + unheard_of  # noqa: F821
+
+
+@ti.kernel
+def calls_a_wrong_function(numbers: ti.types.ndarray(ti.f32, 1)):
+    numbers[0] = wrong_function(numbers[0])
+
+
+def test_an_error_in_a_function_shows_where_it_stands_each_time(taichi_cpu):
+    for _ in range(2):
+        with pytest.raises(ti.TaichiNameError, match=r"in wrong_function:\n +return number \+ unheard_of"):
+            calls_a_wrong_function(ti.ndarray(ti.f32, 3))
+
+
+@ti.func
+def factorial(number: ti.template()) -> ti.i32:
+    product = 1
+    if ti.static(number > 1):
+        product = number * factorial(number - 1)
+    return product
+
+
+@ti.kernel
+def calls_what_calls_itself() -> ti.i32:
+    return factorial(4)
+
+
+def test_a_function_that_calls_itself_is_refused_by_name(taichi_cpu):
+    with pytest.raises(ti.TaichiSyntaxError, match="factorial calls itself"):
+        calls_what_calls_itself()
+    numbers = ti.ndarray(ti.f32, 1)
+    numbers.fill(0.5)
+    thirtyfold(numbers)  # tracing goes on
+    assert numbers.to_numpy()[0] == 15.0
