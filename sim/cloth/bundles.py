@@ -170,6 +170,9 @@ class ThreadWork(NamedTuple):
 
     multiplier: Floats
     tension: Floats  # too much of it, over the length
+    direction: Vectors  # along which it pushes; on a CPU, as what follows
+    change: Floats  # of the multiplier, as far as known
+    factor: Floats  # of the change of the spring before
 
 
 @bundle
@@ -184,24 +187,6 @@ class Air(NamedTuple):
     share: Floats  # of each node in the force on its triangles [-], (n,)
     triangle_start: Integers  # of each node in the list, (n + 1,)
     triangle_list: Integers
-
-
-# --- rows of rectangles ---------------------------------------------------------------------------------------------
-
-
-@bundle
-class Lines(NamedTuple):
-    """Lines of a rectangle along one direction."""
-
-    count: ti.i32
-    length: ti.i32  # nodes of a line
-    first: ti.i32  # block; 0 of upright ones
-    strips: ti.i32  # blocks beside each other
-    other_first: ti.i32  # those of the other direction
-    other_strips: ti.i32
-    first_node: ti.i32
-    line_step: ti.i32  # from a node to the same of the next line
-    node_step: ti.i32  # from a node to the next one of its line
 
 
 # --- patches --------------------------------------------------------------------------------------------------------

@@ -11,11 +11,11 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import CellArrays, MeshNodes, NodeMotion, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
-from sim.cloth.device_springs import TINY_LENGTH, colour_bounds, colour_groups
+from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, set_column
 from sim.cloth.parameters import ClothParameters
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func
-from sim.core.launch import kernel
+from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 
 SHEAR_SWEEPS = 3
@@ -181,20 +181,52 @@ def push_nodes(
 
 
 @func
-def solve_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: ti.i32, multiplier: Floats):
-    """The shear of a cell of a rectangle, by Macklin, Müller & Chentanez 2016, eq. 18, multiplied through by k dt²."""
-    d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, RECTANGLE)
-    d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE)
-    shear, by_u, by_v = shear_of(d_u, d_v)
-    strength = cells.law[s][1] * dt_squared
-    stiffness = strength * weight_along(by_u, by_v, weights(cells, nodes, s))
-    before = ti.select(is_first, 0.0, multiplier[s])
-    change = -over_relaxed(stiffness) * (strength * shear + before) / (stiffness + 1.0)
-    multiplier[s] = before + change
-    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.displacement)
+def solve_shear(
+    first: ti.i32,
+    end: ti.i32,
+    cells: CellArrays,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    multiplier: Floats,
+    lanes: ti.template(),
+):
+    """The shear of so many cells of a colour side by side, or of those that are left, by Macklin, Müller & Chentanez
+    2016, eq. 18, multiplied through by k dt². See `threads.solve_forth` for lanes.
+    """
+    d_u, d_v, w = ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes)
+    strength, before = ti.Vector.zero(ti.f32, lanes), ti.Vector.zero(ti.f32, lanes)
+    count = ti.min(lanes, end - first)
+    for at in range(count):
+        s = first + at
+        p_u, p_v, weight = ti.math.vec3(0.0), ti.math.vec3(0.0), ti.math.vec3(0.0)
+        origin = nodes.lattice[cells.nodes[RECTANGLE * s]]
+        for a in ti.static(range(RECTANGLE)):
+            i = cells.nodes[RECTANGLE * s + a]
+            u, v = cells.along[RECTANGLE * s + a], cells.across[RECTANGLE * s + a]
+            x = nodes.quantum * ti.cast(nodes.lattice[i] - origin, ti.f32) + nodes.displacement[i]
+            p_u, p_v, weight = (
+                p_u + u * x,
+                p_v + v * x,
+                weight + nodes.inverse_mass[i] * ti.math.vec3(u * u, v * v, u * v),
+            )
+        set_column(d_u, at, p_u)
+        set_column(d_v, at, p_v)
+        set_column(w, at, weight)
+        strength[at], before[at] = cells.law[s][1] * dt_squared, ti.select(is_first, 0.0, multiplier[s])
+    for at in range(lanes):
+        shear, by_u, by_v = shear_of(column(d_u, at), column(d_v, at))
+        stiffness = strength[at] * weight_along(by_u, by_v, column(w, at))
+        change = -over_relaxed(stiffness) * (strength[at] * shear + before[at]) / (stiffness + 1.0)
+        before[at] += change
+        set_column(d_u, at, change * by_u)
+        set_column(d_v, at, change * by_v)
+    for at in range(count):
+        multiplier[first + at] = before[at]
+        push_nodes(first + at, cells, nodes, column(d_u, at), column(d_v, at), nodes.displacement)
 
 
-@kernel
+@large_kernel
 def solve_shears(
     cells: CellArrays,
     cell_of_colour: Integers,
@@ -206,12 +238,14 @@ def solve_shears(
 ):
     """The cells of all colours, one after the other; if `is_first`, `SHEAR_SWEEPS` times, from multipliers of 0."""
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    lanes = ti.static(1 if runs_on_gpu() else LANES)
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cell_of_colour, 0, colours, 1)
     for sweep in ti.static(range(SHEAR_SWEEPS)):
         for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
             for s in range(begin, end):
-                if ti.static(sweep == 0) or is_first == 1:
-                    solve_shear(s, cells, nodes, dt_squared, is_first if ti.static(sweep == 0) else 0, multiplier)
+                if (s - begin) % lanes == 0 and (ti.static(sweep == 0) or is_first == 1):
+                    start = is_first if ti.static(sweep == 0) else 0
+                    solve_shear(s, end, cells, nodes, dt_squared, start, multiplier, lanes)
 
 
 @func

@@ -21,6 +21,24 @@ TINY_LENGTH = 1.0e-12
 """Springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there."""
 
 
+LANES = 8
+"""Springs that a thread of a CPU solves side by side: numbers of a vector unit of 256 bits. Local blocks have as many
+columns."""
+
+
+@ti.func
+def column(block: ti.template(), at):
+    """Three numbers of a column."""
+    return ti.Vector([block[0, at], block[1, at], block[2, at]])
+
+
+@ti.func
+def set_column(block: ti.template(), at, vector):
+    """Give a column three numbers."""
+    for c in ti.static(range(3)):
+        block[c, at] = vector[c]
+
+
 class DeviceSprings:
     """Springs with as many nodes each, sorted by colour.
 

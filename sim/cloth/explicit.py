@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, compute_cell_forces
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
-from sim.cloth.parameters import ClothParameters
 from sim.cloth.stable_step import longest_explicit_step
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
@@ -48,7 +47,7 @@ class ExplicitSprings:
         )
         self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
 
-    def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
+    def take_parameters(self) -> None:
         """Springs hold their own stiffness."""
 
     def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:  # noqa: ARG002  (the integrators' protocol)

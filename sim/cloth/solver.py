@@ -23,7 +23,6 @@ from sim.cloth.parameters import (
     shared_conflicts,
 )
 from sim.cloth.pins import Pins
-from sim.cloth.rectangles import rectangles_in_rows
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import joined, springs_of
 from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
@@ -120,12 +119,8 @@ class ClothSolver:
         self.contacts: ContinuousContacts | None = None
         self.load: NodeLoad | None = None
         shared = self.parameters[0]
-        in_rows = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
         first_nodes = host.first_node.tolist()
-        groups = [
-            (number in in_rows, cloth.iterations or 0, cloth.substeps is None)
-            for number, cloth in enumerate(self.parameters)
-        ]
+        groups = [(cloth.iterations or 0, cloth.substeps is None) for cloth in self.parameters]
         springs, cells = (
             joined([elements_of(sheet) for sheet in sheets], first_nodes, groups=groups)
             for elements_of in (springs_of, lambda sheet: [cells_of(sheet)])
@@ -322,7 +317,7 @@ class ClothSolver:
         self.state.set_material(cloths)
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
-        self._integrator.take_parameters(cloths)
+        self._integrator.take_parameters()
         self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
         self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
         self._refines = np.array([cloth.substeps is None for cloth in cloths])

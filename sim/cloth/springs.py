@@ -20,7 +20,7 @@ spring stands for, half on the border):
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -106,8 +106,8 @@ def springs_of(sheet: RestSheet) -> list[Springs]:
 def _grid_threads(grid: Grid) -> Springs:
     """Along x, then along y, thread by thread; colours alternate along each thread from piece to piece."""
     groups, pieces = [], 0
-    for axis, along, step, other in _directions(grid):
-        width = np.broadcast_to(line_widths(len(along), other)[:, None], (len(along), along.shape[1] - 1))
+    for axis, along, step, of_thread in _directions(grid):
+        width = np.broadcast_to(of_thread, (len(along), along.shape[1] - 1))
         piece = np.arange(along.shape[1] - 1) // SEGMENT_LENGTH
         nodes = np.stack([along[:, :-1], along[:, 1:]], axis=-1).reshape(-1, 2)
         count = len(nodes)
@@ -131,8 +131,8 @@ def _grid_threads(grid: Grid) -> Springs:
 def _grid_bends(grid: Grid) -> Springs:
     """Over each inner node along x, then along y."""
     groups = []
-    for axis, along, step, other in _directions(grid):
-        width = np.broadcast_to(line_widths(len(along), other)[:, None], (len(along), max(along.shape[1] - 2, 0)))
+    for axis, along, step, of_thread in _directions(grid):
+        width = np.broadcast_to(of_thread, (len(along), max(along.shape[1] - 2, 0)))
         nodes = np.stack([along[:, :-2], along[:, 1:-1], along[:, 2:]], axis=-1).reshape(-1, 3)
         count = len(nodes)
         colour = np.broadcast_to(3 * axis + np.arange(width.shape[1]) % 3, width.shape)
@@ -141,7 +141,7 @@ def _grid_bends(grid: Grid) -> Springs:
                 nodes,
                 np.tile([1.0, -2.0, 1.0], (count, 1)),
                 np.zeros(count),
-                bend_share(width, step).ravel(),
+                (width / step**3).ravel(),
                 _all(BEND, count),
                 colour.ravel().astype(np.int32),
                 _all(-1, count),
@@ -150,27 +150,15 @@ def _grid_bends(grid: Grid) -> Springs:
     return _joined(groups)
 
 
-def line_widths(lines: int, spacing: float) -> Floats:
-    """Width that each thread of so many, side by side at a spacing [m], stands for [m], (lines,)."""
-    width = np.full(lines, spacing)
-    width[[0, -1]] *= 0.5
-    return width
-
-
-def bend_share(width: Floats, step: float) -> Floats:
-    """Stiffness of bend springs along threads of a width [m] and with nodes at a step [m], over the sheet's [1/m²]."""
-    share: Floats = width / step**3
-    return share
-
-
-def _directions(grid: Grid) -> list[tuple[int, Indices, float, float]]:
-    """Of x and y: number of the axis, nodes of each thread (threads, nodes), their distance, that of threads [m]."""
-    number = _numbers(grid)
-    return [(0, number, grid.step_x, grid.step_y), (1, number.T, grid.step_y, grid.step_x)]
-
-
-def _numbers(grid: Grid) -> Indices:
-    return np.arange(grid.columns * grid.rows, dtype=np.int32).reshape(grid.rows, grid.columns)
+def _directions(grid: Grid) -> Iterator[tuple[int, Indices, float, Floats]]:
+    """Of x and y: number of the axis, nodes of each thread (threads, nodes), their distance [m], and the width that
+    each thread stands for [m], (threads, 1).
+    """
+    number = np.arange(grid.columns * grid.rows, dtype=np.int32).reshape(grid.rows, grid.columns)
+    for axis, along, step, spacing in ((0, number, grid.step_x, grid.step_y), (1, number.T, grid.step_y, grid.step_x)):
+        width = np.full((len(along), 1), spacing)
+        width[[0, -1]] *= 0.5
+        yield axis, along, step, width
 
 
 def _all(value: int, count: int) -> Indices:

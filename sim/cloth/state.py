@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import NodeMotion, Nodes, Surface
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.sheet import Grid, RestSheet
+from sim.cloth.sheet import RestSheet
 from sim.cloth.springs import edges_of
 from sim.cloth.start import quantum_of, start_positions
 from sim.core.arrays import Floats, Integers, Vectors, on_device
@@ -38,7 +38,6 @@ class HostCloths:
         edges: of the triangles, each once, the smaller number first, sorted, (e, 2) int32.
         body: cloth of each node, (n,) int32.
         is_connected: of each cloth, whether it is one piece.
-        grids: of each cloth, how it is divided if it is a rectangle.
     """
 
     names: tuple[str, ...]
@@ -52,7 +51,6 @@ class HostCloths:
     edges: NDArray[np.int32]
     body: NDArray[np.int32]
     is_connected: tuple[bool, ...]
-    grids: tuple[Grid | None, ...]
 
     @classmethod
     def of(cls, cloths: Sequence[ClothParameters], sheets: Sequence[RestSheet]) -> "HostCloths":
@@ -76,7 +74,6 @@ class HostCloths:
             edges=edges_of(triangles).nodes,
             body=np.repeat(np.arange(len(cloths), dtype=np.int32), counts),
             is_connected=tuple(_is_connected(sheet) for sheet in sheets),
-            grids=tuple(sheet.grid for sheet in sheets),
         )
 
     def of_nodes(self, values: Sequence[float]) -> NDArray[np.float64]:

@@ -12,8 +12,6 @@ from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
 from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
-from sim.cloth.parameters import ClothParameters
-from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
 from sim.cloth.triangles import TriangleSolver
@@ -163,22 +161,13 @@ class XPBDSprings:
         self._state, self._springs, self._cells = state, springs, cells
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
-        self._rectangles = {
-            number: RectangleSprings(state, grid, int(state.host.first_node[number]))
-            for number, grid in rectangles_in_rows(state.host).items()
-        }
-        listed = [family for family in springs if not family.cloths & self._rectangles.keys()]
-        self._bends = [family for family in listed if family.arity > PAIR]
-        self._shears = [
-            family for family in cells if family.arity != TRIANGLE and not family.cloths & self._rectangles.keys()
-        ]
+        self._bends = [family for family in springs if family.arity > PAIR]
+        self._shears = [family for family in cells if family.arity != TRIANGLE]
         self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
-        self._threads = [ThreadSolver(family) for family in listed if family.in_segments]
+        self._threads = [ThreadSolver(family) for family in springs if family.in_segments]
 
-    def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
-        """Stiffness of rectangles and mass of meshes as they are now; lists of springs hold their stiffness."""
-        for number, rectangle in self._rectangles.items():
-            rectangle.take_parameters(cloths[number])
+    def take_parameters(self) -> None:
+        """Mass of meshes as it is now; lists of springs hold their stiffness."""
         for triangles in self._triangles:
             triangles.take_parameters()
 
@@ -192,7 +181,6 @@ class XPBDSprings:
 
         def answer() -> NDArray[np.float64]:
             found = [(cloths, *excess()) for cloths, excess in asked]
-            found += [({number}, *rectangle.excess(dt)) for number, rectangle in self._rectangles.items()]
             found += [(triangles.cloths, *triangles.excess()) for triangles in self._triangles]
             self._unconverged = sum(count for *_, count in found)
             largest = np.zeros(len(self._state.names))
@@ -254,17 +242,12 @@ class XPBDSprings:
             self._sweep_lists(self._shears, dt, sweeps > sweep, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
-        for number, rectangle in self._rectangles.items():
-            rectangle.displace(dt, int(sweeps[number]))
         self._momentum.restore(dt)
 
     def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
         """Solve what bears tension in some cloths once more, after contacts have pushed: threads, and the triangles of
         meshes."""
         self._sweep_lists([], dt, cloths, is_first=False)
-        for number, rectangle in self._rectangles.items():
-            if cloths[number]:
-                rectangle.sweep(dt)
 
     def _sweep_lists(
         self, solved: Sequence[DeviceCells], dt: float, cloths: NDArray[np.bool_], *, is_first: bool

@@ -1,15 +1,27 @@
-"""Threads of rectangles in lists, in float64 with whole matrices: what the kernels for GPUs and in rows compute."""
+"""Threads of rectangles in float64 with whole matrices: what the kernels compute."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from sim.cloth import threads
 from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
 from sim.cloth.threads import LEAST_ALIKE, STRAIGHTENED, TURNED_EXPLICITLY
 
 Floats = NDArray[np.float64]
+
+
+@contextmanager
+def threads_in_float64() -> Iterator[None]:
+    """Solvers solve and straighten threads by these functions meanwhile."""
+    with pytest.MonkeyPatch.context() as patch:
+        for solve in (solve_threads, straighten_threads):
+            patch.setattr(threads, solve.__name__, solve)
+        yield
 
 
 def solve_threads(
