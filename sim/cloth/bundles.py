@@ -492,6 +492,17 @@ class PushedBodies(NamedTuple):
 
 
 @bundle
+class Response(NamedTuple):
+    """Contacts, and what they push."""
+
+    contacts: Contacts
+    impulses: Impulses
+    nodes: PushedNodes
+    sums: NodeSums
+    bodies: PushedBodies
+
+
+@bundle
 class CollidingBodies(NamedTuple):
     """Bodies as cloth looks for them, (b,) each."""
 
@@ -520,3 +531,15 @@ class Walls(NamedTuple):
     high: Vectors
     joined_low: Vectors  # 1 on axes on which another wall joins it, else 0
     joined_high: Vectors
+
+
+@bundle
+class Touching(NamedTuple):
+    """Cloth, and what it may touch besides itself."""
+
+    surface: Surface
+    inverse_mass: Floats  # of nodes [1/kg], (n,)
+    walls: Walls
+    bodies: CollidingBodies
+    recovery: ti.f32  # share of a missing distance that the substep gives back [-]
+    contacts: Contacts  # which what touches is appended to

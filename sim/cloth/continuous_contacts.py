@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import NodeSums, PushedNodes
+from sim.cloth.bundles import NodeSums, PushedNodes, Response
 from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
@@ -289,30 +289,18 @@ class ContinuousContacts:
 
     def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
         """A round of the first `STEPS` steps; asks for what `push` returns."""
-        weigh_contacts(
-            self._contacts.found,
-            self._contacts.impulses(self._impulse_unit),
-            state.vertex_count,
-            self._pushed,
-            self._sums,
-            self.rigid.bodies.pushed,
-            int(is_first),
-        )
+        weigh_contacts(self._response, state.vertex_count, int(is_first))
         return self._push_on(state, 0, finishes=True)
 
     def _push_on(self, state: ClothState, first: int, *, finishes: bool) -> Callable[[], list[int]]:
         """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
-        return push.later(
-            _momenta_from(first),
-            int(first == 0),
-            int(finishes),
-            self._contacts.found,
-            self._contacts.impulses(self._impulse_unit),
-            self._pushed,
-            self._sums,
-            state.thickness,
-            self.rigid.bodies.pushed,
-        )
+        momenta = _momenta_from(first)
+        return push.later(momenta, int(first == 0), int(finishes), self._response, state.thickness)
+
+    @property
+    def _response(self) -> Response:
+        impulses = self._contacts.impulses(self._impulse_unit)
+        return Response(self._contacts.found, impulses, self._pushed, self._sums, self.rigid.bodies.pushed)
 
     def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
         """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""

@@ -8,17 +8,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import (
-    CollidingBodies,
-    Contacts,
-    Four,
-    PatchLists,
-    PatchMotion,
-    Surface,
-    Three,
-    Walls,
-    Weights,
-)
+from sim.cloth.bundles import CollidingBodies, Four, PatchLists, PatchMotion, Three, Touching, Walls, Weights
 from sim.cloth.near_pairs import lanes_of_pair
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
@@ -236,12 +226,7 @@ class RigidContact:
             motion,
             margin,
             self._largest_half,
-            state.surface,
-            state.inverse_mass,
-            self._walls,
-            self.bodies.colliding,
-            recovery,
-            contacts.found,
+            Touching(state.surface, state.inverse_mass, self._walls, self.bodies.colliding, recovery, contacts.found),
             SHOWN_BODIES if self._shows.any() else BODIES if self.bodies.count else NO_BODIES,
         )
 
@@ -281,24 +266,23 @@ def fastest_approach(
 
 
 @func
-def touch_wall(
-    i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: ti.f32, allowed: ti.f32, contacts: Contacts
-):
+def touch_wall(i: ti.i32, w: ti.i32, allowed: ti.f32, near: Touching):
     """Append a vertex if it reaches a wall, or would if it were displaced by what is `allowed` besides [m].
 
     Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
     both.
     """
+    surface, walls = ti.static((near.surface, near.walls))
     x, half, n = surface.position[i], 0.5 * surface.thickness[i], walls.plane[w].xyz
     distance = n.dot(x) - walls.plane[w].w
-    least = least_displacement(distance, half, recovery)
+    least = least_displacement(distance, half, near.recovery)
     if distance < half or n.dot(surface.displacement[i]) < least + allowed:
         depth = ti.max(2.0 * WALL_DEPTH * half, walls.spacing, surface.displacement[i].norm())
         is_above = (x >= walls.low[w] - depth * walls.joined_low[w]).all()
         is_below = (x <= walls.high[w] + depth * walls.joined_high[w]).all()
         if is_above and is_below and distance > -depth:
             weights, nothing = ti.math.vec4(1.0, 0.0, 0.0, 0.0), ti.math.vec3(0.0)
-            append_contact(contacts, Four(i), weights, n, least, WALL, nothing, surface.friction[i])
+            append_contact(near.contacts, Four(i), weights, n, least, WALL, nothing, surface.friction[i])
 
 
 @func
@@ -325,41 +309,39 @@ def is_wall_near(m: ti.i32, w: ti.i32, patch: PatchMotion, largest_half: ti.f32,
 
 
 @func
-def allowed_between(
-    m: ti.i32, patch: PatchMotion, margin: Floats, largest_half: ti.f32, walls: Walls, bodies: CollidingBodies
-) -> ti.f32:
+def allowed_between(m: ti.i32, patch: PatchMotion, margin: Floats, largest_half: ti.f32, near: Touching) -> ti.f32:
     """How far contacts may displace a patch into what it does not touch yet [m]: where several bodies or walls are
     near, one may push it into another, which has to be among its contacts then.
     """
-    near = bodies_near(m, patch, largest_half + margin[m], bodies)
-    for w in range(walls.count):
-        near += ti.cast(is_wall_near(m, w, patch, largest_half + margin[m], walls), ti.i32)
-    return ti.select(near > 1, margin[m], 0.0)
+    count = bodies_near(m, patch, largest_half + margin[m], near.bodies)
+    for w in range(near.walls.count):
+        count += ti.cast(is_wall_near(m, w, patch, largest_half + margin[m], near.walls), ti.i32)
+    return ti.select(count > 1, margin[m], 0.0)
 
 
 @func
 def touch_body(
     b: ti.i32,
-    x: ti.math.vec3,
-    u: ti.math.vec3,
-    keeps: ti.f32,
-    own_friction: ti.f32,
-    corners: Four,
+    v: Four,
     weight: ti.math.vec4,
+    keeps: ti.f32,
     across: ti.math.mat3,
     half: ti.f32,
-    recovery: ti.f32,
     allowed: ti.f32,
-    bodies: CollidingBodies,
-    contacts: Contacts,
+    near: Touching,
 ):
-    """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps, or would with
-    what is `allowed` besides [m].
+    """Append a body if a point of the cloth, the weighted mean of vertices, comes nearer to it than it keeps, or would
+    with what is `allowed` besides [m].
 
     Of its gradient there only what is `across` the element counts in which this point is the nearest to the body: on
     an edge of the body gradients are those of its faces, which would push the element along itself. How deep it is gets
     noted in thicknesses, if `half` of that is not 0.
     """
+    surface, bodies = ti.static((near.surface, near.bodies))
+    x, u = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    for k in ti.static(range(4)):
+        if weight[k] != 0.0:
+            x, u = x + weight[k] * surface.position[v[k]], u + weight[k] * surface.displacement[v[k]]
     r = x - bodies.position[b]
     relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
     comes = relative.norm() + allowed
@@ -378,10 +360,10 @@ def touch_body(
                 gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
             n = turned @ unit_or(gradient, y)
             n = unit_or(across @ n, n)
-            least = least_displacement(distance, keeps, recovery)
+            least = least_displacement(distance, keeps, near.recovery)
             if distance < keeps or n.dot(relative) < least + allowed:
-                friction = ti.sqrt(own_friction * bodies.friction[b])
-                append_contact(contacts, corners, weight, n, least, b, r, friction)
+                friction = ti.sqrt(surface.friction[v[0]] * bodies.friction[b])
+                append_contact(near.contacts, v, weight, n, least, b, r, friction)
 
 
 @func
@@ -419,12 +401,7 @@ def find_rigid_contacts(
     motion: PatchMotion,
     margin: Floats,
     largest_half: ti.f32,
-    surface: Surface,
-    inverse_mass: Floats,
-    walls: Walls,
-    bodies: CollidingBodies,
-    recovery: ti.f32,
-    contacts: Contacts,
+    near: Touching,
     meets: ti.template(),
 ) -> ti.math.ivec3:
     """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if cloth `meets` bodies,
@@ -434,42 +411,30 @@ def find_rigid_contacts(
     share a patch, and workers (`sim.core.scheduling`). Returns the numbers of the list's counter, whose first is 0
     then.
     """
-    vertices, elements = ti.static((patches.vertices, patches.elements))
+    vertices, elements, surface, contacts = ti.static((patches.vertices, patches.elements, near.surface, near.contacts))
+    walls, bodies = ti.static((near.walls, near.bodies))
     lanes, workers_end = work[0], work[1]
     begin_sharing(taken, 0)
     for worker in range(workers_end):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < vertices.count * lanes:
             m = item // lanes
-            allowed = allowed_between(m, motion, margin, largest_half, walls, bodies)
+            allowed = allowed_between(m, motion, margin, largest_half, near)
             for w in range(walls.count):
-                is_near = is_wall_near(m, w, motion, largest_half + allowed, walls)
-                place = ti.select(is_near, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                comes = is_wall_near(m, w, motion, largest_half + allowed, walls)
+                place = ti.select(comes, vertices.first[m], vertices.first[m + 1]) + item % lanes
                 while place < vertices.first[m + 1]:
-                    touch_wall(vertices.nodes[place], w, surface, walls, recovery, allowed, contacts)
+                    touch_wall(vertices.nodes[place], w, allowed, near)
                     place += lanes
             if ti.static(meets != NO_BODIES):
-                near = bodies_near(m, motion, largest_half + allowed, bodies)
-                place = ti.select(near > 0, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                is_near = bodies_near(m, motion, largest_half + allowed, bodies) > 0
+                place = ti.select(is_near, vertices.first[m], vertices.first[m + 1]) + item % lanes
                 while place < vertices.first[m + 1]:
                     i = vertices.nodes[place]
-                    half = 0.5 * surface.thickness[i]
+                    half, weight = 0.5 * surface.thickness[i], ti.math.vec4(1.0, 0.0, 0.0, 0.0)
+                    noted, across = ti.select(near.inverse_mass[i] > 0.0, half, 0.0), ti.Matrix.identity(ti.f32, 3)
                     for b in range(bodies.count):
-                        touch_body(
-                            b,
-                            surface.position[i],
-                            surface.displacement[i],
-                            half + bodies.lift[b],
-                            surface.friction[i],
-                            Four(i),
-                            ti.math.vec4(1.0, 0.0, 0.0, 0.0),
-                            ti.Matrix.identity(ti.f32, 3),
-                            ti.select(inverse_mass[i] > 0.0, half, 0.0),
-                            recovery,
-                            allowed,
-                            bodies,
-                            contacts,
-                        )
+                        touch_body(b, Four(i), weight, half + bodies.lift[b], across, noted, allowed, near)
                     place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
     if ti.static(meets == SHOWN_BODIES):
@@ -478,12 +443,12 @@ def find_rigid_contacts(
             item = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
             while item < elements.count * lanes:
                 m = item // lanes
-                allowed = allowed_between(m, motion, margin, largest_half, walls, bodies)
-                near = bodies_near(m, motion, largest_half + allowed, bodies)
+                allowed = allowed_between(m, motion, margin, largest_half, near)
+                is_near = bodies_near(m, motion, largest_half + allowed, bodies) > 0
                 # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
                 edges = elements.first_edge[m + 1] - elements.first_edge[m]
                 end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
-                place = ti.select(near > 0, item % lanes, end)
+                place = ti.select(is_near, item % lanes, end)
                 while place < end:
                     corners = Three(0)
                     if place < edges:
@@ -493,7 +458,7 @@ def find_rigid_contacts(
                         corners = elements.triangles[elements.first_triangle[m] + place - edges]
                     for b in range(bodies.count):
                         if bodies.shows[b] > ti.cast(place < edges, ti.i32):
-                            touch_triangle(b, corners, surface, inverse_mass, recovery, allowed, bodies, contacts)
+                            touch_triangle(b, corners, allowed, near)
                     place += lanes
                 item = next_item(item, worker, taken, 1, PATCHES_AT_A_TIME)
     found = ti.math.ivec3(contacts.counter[0], contacts.counter[1], contacts.counter[2])
@@ -503,16 +468,7 @@ def find_rigid_contacts(
 
 
 @func
-def touch_triangle(
-    b: ti.i32,
-    corners: Three,
-    surface: Surface,
-    inverse_mass: Floats,
-    recovery: ti.f32,
-    allowed: ti.f32,
-    bodies: CollidingBodies,
-    contacts: Contacts,
-):
+def touch_triangle(b: ti.i32, corners: Three, allowed: ti.f32, near: Touching):
     """Append a body if it comes too near to a triangle between its corners, or to an edge: a, b, b; `allowed` is as of
     `touch_body`.
 
@@ -520,9 +476,10 @@ def touch_triangle(
     in the body is where the job wants it. The distance to a convex body is a convex function: it sags nowhere below
     that between the corners by more than three times what it does in their middle.
     """
+    surface, bodies = ti.static((near.surface, near.bodies))
     v, third = corners, 1.0 / 3.0
     half = 0.5 * surface.thickness[v[0]]
-    y, u, x = Corners(0.0), Corners(0.0), Corners(0.0)
+    y, x = Corners(0.0), Corners(0.0)
     comes, nearest = 0.0, 1.0e30
     for k in ti.static(range(3)):
         r = surface.position[v[k]] - bodies.position[b]
@@ -530,8 +487,7 @@ def touch_triangle(
         comes, nearest = ti.max(comes, relative.norm() + allowed), ti.min(nearest, r.norm())
         at = bodies.rotation[b].transpose() @ r + bodies.centre_of_mass[b]
         for axis in ti.static(range(3)):
-            x[k, axis], u[k, axis] = surface.position[v[k]][axis], surface.displacement[v[k]][axis]
-            y[k, axis] = at[axis]
+            x[k, axis], y[k, axis] = surface.position[v[k]][axis], at[axis]
     size = ti.max((y[1, :] - y[0, :]).norm(), (y[2, :] - y[0, :]).norm())
     if nearest < bodies.radius[b] + half + size + comes:
         in_middle = distance_to(y.transpose() @ ti.math.vec3(third), b, bodies.shapes)
@@ -544,7 +500,7 @@ def touch_triangle(
                 distance = distance_to(y.transpose() @ share, b, bodies.shapes)
                 sag += third * distance
                 held = ti.select(k == 0, v[0], ti.select(k == 1, v[1], v[2]))
-                if inverse_mass[held] == 0.0 and distance < 0.0:
+                if near.inverse_mass[held] == 0.0 and distance < 0.0:
                     is_held = True
             is_convex = not is_grid and bodies.shapes.kind[b] != TORUS
             if not is_held and not (is_convex and 3.0 * sag < (1.0 - OF_TRIANGLES) * half):
@@ -560,18 +516,6 @@ def touch_triangle(
                     if share.min() < 1.0 - AT_CORNER:
                         share[0] = 1.0
                 if share.max() < AT_CORNER:
-                    touch_body(
-                        b,
-                        x.transpose() @ share,
-                        u.transpose() @ share,
-                        OF_TRIANGLES * half,
-                        surface.friction[v[0]],
-                        Four(v[0], v[1], v[2], v[0]),
-                        ti.math.vec4(share[0], share[1], share[2], 0.0),
-                        across,
-                        half,
-                        recovery,
-                        allowed,
-                        bodies,
-                        contacts,
-                    )
+                    weight = ti.math.vec4(share[0], share[1], share[2], 0.0)
+                    three = Four(v[0], v[1], v[2], v[0])
+                    touch_body(b, three, weight, OF_TRIANGLES * half, across, half, allowed, near)
