@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, compute_cell_forces
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
-from sim.cloth.stable_step import longest_explicit_step
+from sim.cloth.springs import longest_explicit_step
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.launch import kernel

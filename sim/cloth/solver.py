@@ -24,8 +24,7 @@ from sim.cloth.parameters import (
 )
 from sim.cloth.pins import Pins
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import joined, springs_of
-from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
+from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths, NodeLoad, finish_step
 from sim.cloth.totals import ClothTotals
