@@ -14,8 +14,7 @@ from sim.core.bundles import with_room
 from sim.core.launch import kernel
 from sim.core.parameters import KeyRefusedError, Vector3
 
-WIND = -1
-"""Source of air that is nothing but the wind of a cloth's parameters."""
+WIND = -1  # source of air that is nothing but the wind of a cloth's parameters
 
 Triangles = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
 

@@ -106,8 +106,7 @@ def thickness_between(vertices: ti.types.vector(4, ti.i32), thickness: Floats) -
     return 0.5 * (thickness[vertices[0]] + thickness[vertices[3]])
 
 
-SHARES_PER_UNIT = 65536.0
-"""Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
+SHARES_PER_UNIT = 65536.0  # resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound
 
 MOST_ALIKE = -0.95
 """A vertex is between two sides, and gets a `support`, if the cosine of the angle of their normals is below this: a
@@ -116,8 +115,7 @@ heavy node that meets the edge of a body obliquely would kick it."""
 LEAST_COSINE = 0.86
 """Contacts are turned to the support of their vertices if the cosine of the angle between both lines is larger."""
 
-LEAST_ANSWER = 1.0e-6
-"""Of a vertex that has a support: float32 cannot tell less from none."""
+LEAST_ANSWER = 1.0e-6  # of a vertex that has a support: float32 cannot tell less from none
 
 
 @func
@@ -185,8 +183,7 @@ LEAST_FREE_WEIGHT = 0.05
 """A contact pushes only if its vertices that no pin holds have so much of its weight, so that none moves more than
 twenty times what the contact lacks. Others are only watched: a corner far from a contact of two pins is no lever."""
 
-ALONE = -1
-"""In the place of the first use of a vertex: what stands touches it, and nothing else does."""
+ALONE = -1  # in the place of the first use of a vertex: what stands touches it, and nothing else does
 
 
 @large_kernel
@@ -323,8 +320,7 @@ def settle(c: ti.i32, r: Response) -> ti.math.vec3:
     return push
 
 
-STEPS = 8
-"""Steps of the iteration in one launch: what all iterations have at least."""
+STEPS = 8  # steps of the iteration in one launch: what all iterations have at least
 
 Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
@@ -451,8 +447,7 @@ def finish_push(finishes: ti.i32, count: ti.i32, touched_count: ti.i32, r: Respo
         bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
 
 
-TOLERANCE = 0.02
-"""Part of their thickness by which contacts may miss what they should keep."""
+TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they should keep
 
 
 @large_kernel

@@ -30,8 +30,7 @@ MORE_ITERATIONS = 16
 """Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
 in stacks and impacts; two layers under their weight need one step."""
 
-REPAIRS = 4
-"""Rounds in which crossing pairs are pushed before they become impact zones."""
+REPAIRS = 4  # rounds in which crossing pairs are pushed before they become impact zones
 
 RECOVERY_TIME_S = 0.01
 """Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""

@@ -17,8 +17,7 @@ MOST_COLOURS_AT_ONCE = 6
 """Colours that are loops of one kernel, at most, as many as bends of rectangles have: a launch costs 20 us of the host,
 and every loop its time to compile."""
 
-TINY_LENGTH = 1.0e-12
-"""Springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there."""
+TINY_LENGTH = 1.0e-12  # springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there
 
 
 LANES = 8

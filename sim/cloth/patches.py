@@ -21,11 +21,8 @@ if TYPE_CHECKING:
 BLOCK = 16
 """Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""
 
-FAR = 1.0e9
-"""Coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32."""
-
-NONE = -1
-"""In the place of a vertex: the block has no element there."""
+FAR = 1.0e9  # coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32
+NONE = -1  # in the place of a vertex: the block has no element there
 
 TRIANGLES_PER_PATCH, ON_GPU = 32, 24
 """Most triangles of a patch: few enough for all of them to move nearly as one, and enough for one pair of patches to

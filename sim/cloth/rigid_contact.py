@@ -38,8 +38,7 @@ from sim.shapes.device_shapes import CAPSULE, GRID, SPHERE, TORUS, DeviceShapes,
 
 Array = NDArray[np.float64]
 
-LOAD_UNIT = 1.0e-6
-"""Unit of sums of the square roots of mobilities, in the largest of them."""
+LOAD_UNIT = 1.0e-6  # unit of sums of the square roots of mobilities, in the largest of them
 
 _ROUND = (SPHERE, CAPSULE, TORUS)
 
@@ -142,8 +141,7 @@ class CollisionBodies(DeviceShapes):
 
 Array = NDArray[np.float64]
 
-PATCHES_AT_A_TIME = 4
-"""Patches that a thread takes at a time: those that touch a body take some microseconds each."""
+PATCHES_AT_A_TIME = 4  # patches that a thread takes at a time: those that touch a body take some microseconds each
 
 LARGEST_ADVANCE = 0.25
 """How far cloth and a body that it may meet may move against each other in a step, in half shortest edges of that
@@ -160,11 +158,8 @@ LARGEST_LIFT = 0.25
 """How much farther from a round body than half their thickness vertices may be kept, in thicknesses, so that it does
 not show between them: triangles need not be looked at, which have four times the contacts."""
 
-SEARCH_LEVELS = 5
-"""How often the deepest point of a triangle is looked for around the last: to a 24th of its edges."""
-
-AT_CORNER = 0.98
-"""What has this barycentric coordinate is a vertex."""
+SEARCH_LEVELS = 5  # how often the deepest point of a triangle is looked for around the last: to a 24th of its edges
+AT_CORNER = 0.98  # what has this barycentric coordinate is a vertex
 
 WITH_EDGES = 2
 """In `CollisionBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one

@@ -17,8 +17,7 @@ from sim.shapes.solid import ShapeError
 Vectors = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-SMALLEST_LENGTH, LARGEST_LENGTH = 1.0e-6, 1.0e6
-"""Of what a sheet measures [m]; single precision ends well within."""
+SMALLEST_LENGTH, LARGEST_LENGTH = 1.0e-6, 1.0e6  # of what a sheet measures [m]; single precision ends well within
 
 FLAT_TRIANGLE = 1.0e-4
 """A triangle less high than this share of its longest edge is a line: its angles are round-off in a file's float32."""

@@ -36,8 +36,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 Group = tuple[int, ...]
 
-ALONG_X, ALONG_Y, BEND = range(3)
-"""Of a spring: a thread of a rectangle along x or y, or a bend."""
+ALONG_X, ALONG_Y, BEND = range(3)  # of a spring: a thread of a rectangle along x or y, or a bend
 
 SEGMENT_LENGTH = 1023
 """Springs of a thread that are solved at once, at most: with as many nodes as a block of a GPU has threads."""

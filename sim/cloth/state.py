@@ -212,8 +212,7 @@ def round_positions(nodes: Nodes, carry: Vectors, position: Vectors):
         nodes.displacement[i] = carry[i]
 
 
-LARGEST_MOVE = 2.0**29
-"""Most quanta in a step: a quarter of the lattice, so that integers do not overflow."""
+LARGEST_MOVE = 2.0**29  # most quanta in a step: a quarter of the lattice, so that integers do not overflow
 
 
 @kernel

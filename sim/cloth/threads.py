@@ -18,17 +18,13 @@ TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
 across threads need dt² 4 T w / |d| <= 4, summed over the two threads of a node."""
 
-LEAST_BLOCK = 32
-"""Threads of a block of a GPU, at least: those that it runs as one."""
+LEAST_BLOCK = 32  # threads of a block of a GPU, at least: those that it runs as one
 
 STRAIGHTENED = 0.35
 """Part of what is more that turns with the springs: waves are stable from 1/4 on, and neither damped nor driven."""
 
-LEAST_WEIGHT = 1.0e-20
-"""Inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions."""
-
-LEAST_ALIKE = 0.995
-"""Cosine of the angle that a spring may turn by in a step for its direction to be that of the start."""
+LEAST_WEIGHT = 1.0e-20  # inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions
+LEAST_ALIKE = 0.995  # cosine of the angle that a spring may turn by in a step for its direction to be that of the start
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a

@@ -13,28 +13,21 @@ from sim.core.bundles import func, with_room
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, LaneReduction, Results, Share, reduced_tree, runs_on_gpu
 
-ITERATIONS_AT_ONCE = 4
-"""Iterations between two looks at how far the last ones led."""
-
-MOST_ITERATIONS = 200
-"""More are only asked for by steps in which a wave crosses hundreds of triangles."""
+ITERATIONS_AT_ONCE = 4  # iterations between two looks at how far the last ones led
+MOST_ITERATIONS = 200  # more are only asked for by steps in which a wave crosses hundreds of triangles
 
 TOLERANCE = 0.03
 """Of the displacement by triangles in a step, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
 
-LEAST_ACCELERATION = 1.0
-"""By triangles, of which `TOLERANCE` is at least [m/s²]: 0.3 % of the weight."""
+LEAST_ACCELERATION = 1.0  # by triangles, of which `TOLERANCE` is at least [m/s²]: 0.3 % of the weight
 
 ROOT_HALF = 0.5**0.5
 
 BLOCK_SHARE = OWN_SHARE + (1.0 - OWN_SHARE) / 6.0
 """What blocks of nodes have of the stiffness of triangles, on equal triangles."""
 
-TINY_ENERGY = 1.0e-37
-"""Least divisor of energies [kg m²]: without any, there is nothing to solve."""
-
-HELD = 1.0e30
-"""Mass of held nodes in the sums over pieces [kg]."""
+TINY_ENERGY = 1.0e-37  # least divisor of energies [kg m²]: without any, there is nothing to solve
+HELD = 1.0e30  # mass of held nodes in the sums over pieces [kg]
 
 
 class TriangleSolver:

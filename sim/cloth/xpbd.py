@@ -20,8 +20,7 @@ from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, Share, Tree, device_lanes, reduced, runs_on_gpu
 
-QUANTITIES = 13
-"""Mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)."""
+QUANTITIES = 13  # mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)
 
 LEAST_INERTIA = 1.0e-6
 """About its long axis a cloth counts as no thinner than this, as a share of the sum of its moments of inertia [-]."""
