@@ -26,16 +26,10 @@ class ClothAir:
     per area of cloth, feels the opposite impulse, and is never pushed beyond the cloth's velocity.
 
     Attributes:
-        velocity: of the air at each triangle [m/s], (k,) vec3.
-        inverse_mass: area of cloth over the mass of the air that it acts on [m²/kg], (k,); 0 for wind.
+        velocity, inverse_mass, force, impulse, share, triangle_start, triangle_list: see `bundles.Air`.
         source: number of what the air belongs to, (k,) int32; `WIND` for wind.
         density: of the air [kg/m³], (k,); 0 where it drags nothing.
-        force: of the air on each triangle in the last substep [N], (k,) vec3.
-        impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3.
         wind: of the parameters [m/s], (k,) vec3.
-        share: of each node in the force on any of its triangles [-], (n,).
-        triangle_start: the triangles of node i are `triangle_list[triangle_start[i]:triangle_start[i + 1]]`.
-        triangle_list: in ascending order of the nodes, then of the triangles.
         acts: whether any cloth has air that drags.
         is_shared: whether a coupling puts air there, of which there is one for all cloths.
     """

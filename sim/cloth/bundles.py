@@ -33,15 +33,15 @@ class Nodes(NamedTuple):
 
     lattice: Lattice  # where the substep starts, in quanta, (n,)
     quantum: ti.f32  # [m]
-    inverse_mass: Floats  # [1/kg], (n,)
-    displacement: Vectors  # in the substep [m], (n,)
+    inverse_mass: Floats  # [1/kg], (n,); 0 where a node is pinned
+    displacement: Vectors  # from the lattice's position to the end of the substep, `carry` included [m], (n,)
 
 
 @bundle
 class NodeMotion(NamedTuple):
     """Motion of nodes at the start of a substep."""
 
-    carry: Vectors  # [m], (n,)
+    carry: Vectors  # what the lattice lacks [m], (n,), at most half a quantum
     velocity: Vectors  # [m/s], (n,)
 
 
@@ -49,10 +49,10 @@ class NodeMotion(NamedTuple):
 class Surface(NamedTuple):
     """Nodes as contacts are looked for."""
 
-    position: Vectors  # at the start of the substep [m], (n,)
+    position: Vectors  # where the substep starts, rounded to float32 [m], (n,)
     displacement: Vectors  # [m], (n,)
-    thickness: Floats  # [m], (n,)
-    friction: Floats  # [-], (n,)
+    thickness: Floats  # distance that layers keep [m], (n,)
+    friction: Floats  # Coulomb's coefficient [-], (n,)
 
 
 @bundle
@@ -180,12 +180,12 @@ class Air(NamedTuple):
     """Air at the triangles."""
 
     velocity: Vectors  # [m/s], (k,)
-    inverse_mass: Floats  # area of cloth over mass of air [m²/kg], (k,)
+    inverse_mass: Floats  # area of cloth over mass of the air that it acts on [m²/kg], (k,); 0 for wind
     drag: Vectors  # rho C_n / 2, rho C_t / 2 [kg/m³], mass of the triangle [kg], (k,)
-    force: Vectors  # [N], (k,)
-    impulse: Vectors  # [N s], (k,)
-    share: Floats  # of each node in the force on its triangles [-], (n,)
-    triangle_start: Integers  # of each node in the list, (n + 1,)
+    force: Vectors  # on each triangle in the last substep [N], (k,)
+    impulse: Vectors  # since a coupling set it to zero [N s], (k,)
+    share: Floats  # of each node in the force on any of its triangles [-], (n,)
+    triangle_start: Integers  # of each node in the list, which has triangles in ascending order, (n + 1,)
     triangle_list: Integers
 
 

@@ -196,24 +196,13 @@ def solve_shear(
     """
     d_u, d_v, w = ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes)
     strength, before = ti.Vector.zero(ti.f32, lanes), ti.Vector.zero(ti.f32, lanes)
-    count = ti.min(lanes, end - first)
-    for at in range(count):
+    for at in range(lanes):
         s = first + at
-        p_u, p_v, weight = ti.math.vec3(0.0), ti.math.vec3(0.0), ti.math.vec3(0.0)
-        origin = nodes.lattice[cells.nodes[RECTANGLE * s]]
-        for a in ti.static(range(RECTANGLE)):
-            i = cells.nodes[RECTANGLE * s + a]
-            u, v = cells.along[RECTANGLE * s + a], cells.across[RECTANGLE * s + a]
-            x = nodes.quantum * ti.cast(nodes.lattice[i] - origin, ti.f32) + nodes.displacement[i]
-            p_u, p_v, weight = (
-                p_u + u * x,
-                p_v + v * x,
-                weight + nodes.inverse_mass[i] * ti.math.vec3(u * u, v * v, u * v),
-            )
-        set_column(d_u, at, p_u)
-        set_column(d_v, at, p_v)
-        set_column(w, at, weight)
-        strength[at], before[at] = cells.law[s][1] * dt_squared, ti.select(is_first, 0.0, multiplier[s])
+        if s < end:
+            set_column(d_u, at, derivative(cells.along, cells, nodes, nodes.displacement, s, RECTANGLE))
+            set_column(d_v, at, derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE))
+            set_column(w, at, weights(cells, nodes, s))
+            strength[at], before[at] = cells.law[s][1] * dt_squared, ti.select(is_first, 0.0, multiplier[s])
     for at in range(lanes):
         shear, by_u, by_v = shear_of(column(d_u, at), column(d_v, at))
         stiffness = strength[at] * weight_along(by_u, by_v, column(w, at))
@@ -221,9 +210,10 @@ def solve_shear(
         before[at] += change
         set_column(d_u, at, change * by_u)
         set_column(d_v, at, change * by_v)
-    for at in range(count):
-        multiplier[first + at] = before[at]
-        push_nodes(first + at, cells, nodes, column(d_u, at), column(d_v, at), nodes.displacement)
+    for at in range(lanes):
+        if first + at < end:
+            multiplier[first + at] = before[at]
+            push_nodes(first + at, cells, nodes, column(d_u, at), column(d_v, at), nodes.displacement)
 
 
 @large_kernel

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, compute_cell_forces
@@ -27,23 +28,16 @@ class ExplicitSprings:
         counts = [family.count for family in springs] + [2 * family.count for family in cells]
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
         acting = [(family.host.nodes, family.host.coefficients) for family in springs]
-        for family in cells:  # two forces each, which act along d_u and d_v
-            host = family.host
-            acting.append(
-                (np.repeat(host.nodes, 2, axis=0), np.stack([host.along, host.across], axis=1).reshape(-1, host.arity))
-            )
-        nodes = np.concatenate([nodes.ravel() for nodes, _ in acting])
-        spring = np.concatenate(
-            [
-                np.repeat(first + np.arange(len(nodes)), nodes.shape[1])
-                for first, (nodes, _) in zip(self._first[:-1], acting, strict=True)
-            ]
-        )
-        coefficients = np.concatenate([coefficients.ravel() for _, coefficients in acting])
-        order = np.argsort(nodes, kind="stable")
-        start = np.searchsorted(nodes[order], np.arange(state.vertex_count + 1))
+        for host in (family.host for family in cells):  # two forces each, which act along d_u and d_v
+            both = np.stack([host.along, host.across], axis=1).reshape(-1, host.arity)
+            acting.append((np.repeat(host.nodes, 2, axis=0), both))
+        numbered = zip(self._first[:-1], acting, strict=True)
+        forces = [np.repeat(first + np.arange(len(nodes)), nodes.shape[1]) for first, (nodes, _) in numbered]
+        nodes, coefficients = (np.concatenate([each.ravel() for each in part]) for part in zip(*acting, strict=True))
+        shape = state.vertex_count, int(self._first[-1])
+        gathered = coo_array((coefficients, (nodes, np.concatenate(forces))), shape=shape).tocsr()
         self._start, self._spring, self._coefficient = (
-            on_device(each) for each in (start, spring[order], coefficients[order])
+            on_device(each) for each in (gathered.indptr, gathered.indices, gathered.data)
         )
         self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
 

@@ -103,20 +103,11 @@ class ClothState:
 
     Attributes:
         host: what they started with, on the host.
-        lattice: at the start of the substep, in quanta, (n,) ivec3.
-        position: the same rounded to float32 [m], (n,) vec3.
-        carry: what the lattice lacks [m], (n,) vec3, at most half a quantum.
-        displacement: from the lattice's position to the end of the substep, `carry` included [m], (n,) vec3.
-        velocity: [m/s], (n,) vec3.
+        nodes, motion, surface: arrays for kernels; each also an attribute of its own.
         elastic: by how much triangles of meshes displaced nodes in the last step [m], (n,) vec3; 0 elsewhere.
         mass: of a node [kg], (n,), pinned or not.
-        inverse_mass: [1/kg], (n,); 0 where a node is pinned.
-        thickness: distance that layers keep [m], (n,).
-        friction: Coulomb's coefficient [-], (n,).
         body: cloth of a node, (n,) int32.
-        triangles: (k,) ivec3.
-        edges: (e,) ivec2.
-        nodes, motion, surface: some of these arrays for kernels.
+        triangles, edges: (k,) ivec3, (e,) ivec2.
         names: of the cloths.
         self_collision: of each cloth: whether it collides with itself.
         is_free: of each cloth: whether it is one piece, and no pin holds any of its nodes.
