@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
@@ -19,12 +18,10 @@ from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
+from sim.cloth.state import ClothState
 from sim.core.bundles import with_room
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction, runs_on_gpu
-
-if TYPE_CHECKING:
-    from sim.cloth.state import ClothState
 
 MORE_ITERATIONS = 16
 """Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as

@@ -5,18 +5,15 @@ of their elements, laid out so that a processor compares one element with a bloc
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.bundles import EdgeBlocks, PatchElements, PatchNodes, TriangleBlocks
+from sim.cloth.state import HostCloths
 from sim.core.arrays import on_device
 from sim.core.reductions import runs_on_gpu
-
-if TYPE_CHECKING:
-    from sim.cloth.state import HostCloths
 
 BLOCK = 16
 """Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""

@@ -44,25 +44,10 @@ REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.03, 0
 which springs and contacts take another turn; below which sweeps go back, and below which steps do: turns end between
 both. It falls with every turn and sweep, and with the square of the step."""
 
-LIVE_KEYS = frozenset(
-    (
-        "mass_per_area",
-        "stretch_stiffness",
-        "shear_stiffness",
-        "poisson_ratio",
-        "bend_stiffness",
-        "damping",
-        "bend_damping",
-        "thickness",
-        "friction",
-        "self_collision",
-        "wind",
-        "air_density",
-        "drag",
-        "skin_drag",
-    )
+FIXED_KEYS = frozenset(
+    ("name", "shape", "position", "rotation_deg", "velocity", "material", "pin", "integrator", "substeps", "iterations")
 )
-"""What may change between frames."""
+"""What cannot change between frames; all else can."""
 
 
 class ClothSolver:
@@ -145,7 +130,7 @@ class ClothSolver:
         Raises:
             ValueError: a key that cannot change, or a value that it cannot have; nothing has changed then.
         """
-        if fixed := set(changes) - LIVE_KEYS:
+        if fixed := set(changes) - (ClothParameters.model_fields.keys() - FIXED_KEYS):
             raise ValueError(f"{min(fixed)} of a cloth cannot change while it is simulated; build it anew")
         number = self.state.names.index(name)
         changed = ClothParameters.model_validate({**self.parameters[number].model_dump(exclude_unset=True), **changes})
