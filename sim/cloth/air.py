@@ -16,8 +16,6 @@ from sim.core.parameters import KeyRefusedError, Vector3
 
 WIND = -1  # source of air that is nothing but the wind of a cloth's parameters
 
-Triangles = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
-
 
 class ClothAir:
     """The air at every triangle, and its force.
@@ -51,7 +49,8 @@ class ClothAir:
         around = np.bincount(triangles.ravel(), weights=np.repeat(triangle_areas(host.position, triangles), 3))
         of_nodes = [on_device(each) for each in (host.node_area / around, start, order // 3)]
         self.share, self.triangle_start, self.triangle_list = of_nodes
-        self._on_device: Air = with_room(Air, count, **dict(zip(Air._fields[-3:], of_nodes, strict=True)))
+        of_nodes.append(state.triangles)
+        self._on_device: Air = with_room(Air, count, **dict(zip(Air._fields[-4:], of_nodes, strict=True)))
         self.velocity, self.inverse_mass, self._drag, self.force, self.impulse, *_ = self._on_device
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
@@ -84,17 +83,7 @@ class ClothAir:
         """Accelerate the nodes by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
         state = self._state
         count = state.triangle_count if self.acts else 0
-        predict_in_air(
-            state.position,
-            state.triangles,
-            count,
-            self._on_device,
-            state.nodes,
-            state.motion,
-            state.vertex_count,
-            gravity,
-            dt,
-        )
+        predict_in_air(self._on_device, count, state.position, state.nodes, state.motion, gravity, dt)
 
 
 @ti.func
@@ -127,13 +116,11 @@ def drag_along(
 
 @kernel
 def predict_in_air(
-    position: Vectors,
-    triangles: Triangles,
-    triangle_count: ti.i32,
     air: Air,
+    triangle_count: ti.i32,
+    position: Vectors,
     nodes: Nodes,
     motion: NodeMotion,
-    count: ti.i32,
     gravity: ti.math.vec3,
     dt: ti.f32,
 ):
@@ -153,8 +140,9 @@ def predict_in_air(
     with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
     not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
     """
+    count = position.shape[0]
     for t in range(triangle_count):
-        a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
+        a, b, c = air.triangles[t][0], air.triangles[t][1], air.triangles[t][2]
         x_a = position[a]
         cross = (position[b] - x_a).cross(position[c] - x_a)
         squared = cross.dot(cross)
@@ -167,7 +155,7 @@ def predict_in_air(
             mean += air.share[c] * motion.velocity[c]
             free = 0.0
             for k in ti.static(range(3)):
-                i = triangles[t][k]
+                i = air.triangles[t][k]
                 free += ti.select(nodes.inverse_mass[i] > 0.0, air.share[i], 0.0)
             mobility = free * area / air.drag[t][2]
             air_mobility = air.inverse_mass[t]

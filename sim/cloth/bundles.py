@@ -65,12 +65,14 @@ class Rest(NamedTuple):
 
 @bundle
 class SpringArrays(NamedTuple):
-    """Springs of one family, s of them."""
+    """Springs of one family, s of them; a piece is one spring where they are solved one by one."""
 
     nodes: Integers  # (arity s,)
     law: Laws  # rest length [m], stiffness [N/m], damping over stiffness [s], (s,)
     coefficients: Floats  # of springs with four nodes, (4 s,)
     shift: Floats  # what springs of threads count as longer, because of the strain across [m], (s,)
+    segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
+    piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
 
 
 @bundle
@@ -81,6 +83,8 @@ class CellArrays(NamedTuple):
     along: Floats  # c_a of d_u [1/m], (arity s,)
     across: Floats  # c_a of d_v [1/m], (arity s,)
     law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
+    cell_of_colour: Integers  # first cell of each colour, and number of cells, (colours + 1,)
+    multiplier: Floats  # of the shear, (s,); rectangles only
 
 
 @bundle
@@ -156,15 +160,6 @@ class Contraction(NamedTuple):
 
 
 @bundle
-class Pieces(NamedTuple):
-    """Pieces of threads."""
-
-    segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
-    piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
-    is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
-
-
-@bundle
 class ThreadWork(NamedTuple):
     """Numbers of each spring of threads within a substep, (s,) each."""
 
@@ -173,6 +168,7 @@ class ThreadWork(NamedTuple):
     direction: Vectors  # along which it pushes; on a CPU, as what follows
     change: Floats  # of the multiplier, as far as known
     factor: Floats  # of the change of the spring before
+    is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
 
 
 @bundle
@@ -187,6 +183,7 @@ class Air(NamedTuple):
     share: Floats  # of each node in the force on any of its triangles [-], (n,)
     triangle_start: Integers  # of each node in the list, which has triangles in ascending order, (n + 1,)
     triangle_list: Integers
+    triangles: Triples  # their nodes, (k,)
 
 
 # --- patches --------------------------------------------------------------------------------------------------------

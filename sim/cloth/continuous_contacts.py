@@ -97,10 +97,7 @@ class ContinuousContacts:
         asked, self._velocities = self._velocities or box_of(state.velocity, 0, n, self._ends), None
         velocity = asked()
         shortest = self.rigid.stable_dt(
-            state,
-            range(n),
-            velocity,
-            at_most=self._little_motion(velocity, at_most) if self._pairs.meets else at_most,
+            state, range(n), velocity, at_most=self._little_motion(velocity, at_most) if self._pairs.meets else at_most
         )
         if shortest == at_most or len(state.names) == 1:
             return shortest

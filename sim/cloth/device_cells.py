@@ -13,7 +13,7 @@ from sim.cloth.bundles import CellArrays, MeshNodes, NodeMotion, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
 from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, set_column
 from sim.cloth.parameters import ClothParameters
-from sim.core.arrays import Floats, Integers, Vectors, on_device
+from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
@@ -37,8 +37,6 @@ class DeviceCells:
         first_colours: as of `DeviceSprings`.
         mesh: nodes of triangles; nothing of rectangles.
         own, chunks, pieces: how many nodes, chunks and pieces those are.
-        cell_of_colour: first cell of each colour, and number of cells, (colours + 1,).
-        multiplier: of the shear, (count,); rectangles only.
     """
 
     def __init__(self, cells: Cells, cloth_of: NDArray[np.int32]) -> None:
@@ -47,11 +45,11 @@ class DeviceCells:
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
         self.is_damped = False
-        self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
-        self.multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
+        self.first_colours, cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
+        multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
         self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
         listed = (on_device(each.ravel()) for each in (cells.nodes, cells.along, cells.across))
-        self.on_device = CellArrays(*listed, ti.Vector.ndarray(4, ti.f32, self.count))
+        self.on_device = CellArrays(*listed, ti.Vector.ndarray(4, ti.f32, self.count), cell_of_colour, multiplier)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
@@ -165,14 +163,7 @@ def weight_along(by_u: ti.math.vec3, by_v: ti.math.vec3, w: ti.math.vec3):
 
 
 @func
-def push_nodes(
-    s: ti.i32,
-    cells: CellArrays,
-    nodes: Nodes,
-    p_u: ti.math.vec3,
-    p_v: ti.math.vec3,
-    changed: Vectors,
-):
+def push_nodes(s: ti.i32, cells: CellArrays, nodes: Nodes, p_u: ti.math.vec3, p_v: ti.math.vec3, changed: Vectors):
     """Give the nodes of a cell what pushes along d_u and d_v change of displacements or velocities."""
     for a in ti.static(range(RECTANGLE)):
         i = cells.nodes[RECTANGLE * s + a]
@@ -188,7 +179,6 @@ def solve_shear(
     nodes: Nodes,
     dt_squared: ti.f32,
     is_first: ti.i32,
-    multiplier: Floats,
     lanes: ti.template(),
 ):
     """The shear of so many cells of a colour side by side, or of those that are left, by Macklin, Müller & Chentanez
@@ -202,7 +192,7 @@ def solve_shear(
             set_column(d_u, at, derivative(cells.along, cells, nodes, nodes.displacement, s, RECTANGLE))
             set_column(d_v, at, derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE))
             set_column(w, at, weights(cells, nodes, s))
-            strength[at], before[at] = cells.law[s][1] * dt_squared, ti.select(is_first, 0.0, multiplier[s])
+            strength[at], before[at] = cells.law[s][1] * dt_squared, ti.select(is_first, 0.0, cells.multiplier[s])
     for at in range(lanes):
         shear, by_u, by_v = shear_of(column(d_u, at), column(d_v, at))
         stiffness = strength[at] * weight_along(by_u, by_v, column(w, at))
@@ -212,30 +202,22 @@ def solve_shear(
         set_column(d_v, at, change * by_v)
     for at in range(lanes):
         if first + at < end:
-            multiplier[first + at] = before[at]
+            cells.multiplier[first + at] = before[at]
             push_nodes(first + at, cells, nodes, column(d_u, at), column(d_v, at), nodes.displacement)
 
 
 @large_kernel
-def solve_shears(
-    cells: CellArrays,
-    cell_of_colour: Integers,
-    nodes: Nodes,
-    dt_squared: ti.f32,
-    is_first: ti.i32,
-    multiplier: Floats,
-    colours: ti.template(),
-):
+def solve_shears(cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: ti.i32, colours: ti.template()):
     """The cells of all colours, one after the other; if `is_first`, `SHEAR_SWEEPS` times, from multipliers of 0."""
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     lanes = ti.static(1 if runs_on_gpu() else LANES)
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cell_of_colour, 0, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, 0, colours, 1)
     for sweep in ti.static(range(SHEAR_SWEEPS)):
         for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
             for s in range(begin, end):
                 if (s - begin) % lanes == 0 and (ti.static(sweep == 0) or is_first == 1):
                     start = is_first if ti.static(sweep == 0) else 0
-                    solve_shear(s, end, cells, nodes, dt_squared, start, multiplier, lanes)
+                    solve_shear(s, end, cells, nodes, dt_squared, start, lanes)
 
 
 @func
@@ -255,17 +237,11 @@ def damp_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, d
 
 @kernel
 def damp_shears(
-    cells: CellArrays,
-    cell_of_colour: Integers,
-    colour: ti.i32,
-    nodes: Nodes,
-    motion: NodeMotion,
-    dt: ti.f32,
-    colours: ti.template(),
+    cells: CellArrays, colour: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32, colours: ti.template()
 ):
     """The cells of so many colours, one colour after the other."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cell_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
             damp_shear(s, cells, nodes, motion, dt)
@@ -294,13 +270,7 @@ def tension_of(s: ti.i32, cells: CellArrays, mesh: MeshNodes, strain: Strains, m
 
 @kernel
 def measure_strains(
-    cells: CellArrays,
-    count: ti.i32,
-    mesh: MeshNodes,
-    own: ti.i32,
-    nodes: Nodes,
-    motion: NodeMotion,
-    is_damped: ti.i32,
+    cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, motion: NodeMotion, is_damped: ti.i32
 ):
     """Strains of triangles, with tau times their rates if `is_damped`; then of nodes."""
     for s in range(count):

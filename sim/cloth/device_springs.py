@@ -50,10 +50,7 @@ class DeviceSprings:
         contracts: whether any of them feels the strain across.
         first_colours: first colour of each group of those that are solved in one launch, `first_colours.step` each;
             the last group may have empty ones.
-        piece_of_colour: first piece of each colour, and number of pieces, (colours + 1,); a piece is one spring where
-            springs are solved one by one.
         in_segments: whether these are threads.
-        segment_start: first spring of each piece, and number of springs, (pieces + 1,).
         host: the springs on the host.
         cloths: numbers of the cloths that they belong to.
     """
@@ -62,16 +59,17 @@ class DeviceSprings:
         self.host, self._cloth_of = springs, cloth_of
         self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = springs.arity, len(springs)
+        self.in_segments = springs.in_segments
+        starts = np.flatnonzero(np.diff(springs.segment, prepend=-1)) if self.in_segments else np.arange(self.count)
+        self.first_colours, piece_of_colour = colour_groups(springs.colour, starts, len(starts))
         self.on_device = SpringArrays(
             nodes=on_device(springs.nodes.ravel()),
             law=ti.Vector.ndarray(3, ti.f32, self.count),
             coefficients=on_device(springs.coefficients.ravel() if self.arity == 4 else np.zeros(1)),
             shift=ti.ndarray(ti.f32, self.count),
+            segment_start=on_device(np.append(starts, self.count)),
+            piece_of_colour=piece_of_colour,
         )
-        self.in_segments = springs.in_segments
-        starts = np.flatnonzero(np.diff(springs.segment, prepend=-1)) if self.in_segments else np.arange(self.count)
-        self.segment_start = on_device(np.append(starts, self.count))
-        self.first_colours, self.piece_of_colour = colour_groups(springs.colour, starts, len(starts))
         self.stiffness: NDArray[np.float64] = np.zeros(self.count)
         self.damping: NDArray[np.float64] = np.zeros(self.count)
         self.poisson: NDArray[np.float64] = np.zeros(self.count)

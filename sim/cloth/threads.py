@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import taichi as ti
 
-from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
+from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays, ThreadWork
 from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers
@@ -55,9 +55,9 @@ class ThreadSolver:
 
     def __init__(self, springs: DeviceSprings) -> None:
         self.springs = springs
-        starts = springs.segment_start.to_numpy()
-        self._work: ThreadWork = with_room(ThreadWork, springs.count)
-        self._pieces = Pieces(springs.segment_start, springs.piece_of_colour, ti.ndarray(ti.i32, len(starts) - 1))
+        starts = springs.on_device.segment_start.to_numpy()
+        is_taut = ti.ndarray(ti.i32, len(starts) - 1)
+        self._work: ThreadWork = with_room(ThreadWork, springs.count, is_taut=is_taut)
         self._found = ti.ndarray(ti.i32, 2)
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
@@ -70,7 +70,6 @@ class ThreadSolver:
         for colour in springs.first_colours:
             solve_threads(
                 springs.on_device,
-                self._pieces,
                 colour,
                 state.nodes,
                 dt,
@@ -91,7 +90,6 @@ class ThreadSolver:
         for colour in springs.first_colours:
             straighten_threads(
                 springs.on_device,
-                self._pieces,
                 colour,
                 state.nodes,
                 state.motion,
@@ -165,14 +163,7 @@ def reduced_row(j, rows: ti.template(), lower, diagonal, upper, right, shared: t
 
 @func
 def solve_forth(
-    first: ti.i32,
-    end: ti.i32,
-    springs: SpringArrays,
-    pieces: Pieces,
-    nodes: Nodes,
-    dt: ti.f32,
-    is_first: ti.i32,
-    work: ThreadWork,
+    first: ti.i32, end: ti.i32, springs: SpringArrays, nodes: Nodes, dt: ti.f32, is_first: ti.i32, work: ThreadWork
 ):
     """Eliminate the rows of `LANES` pieces, or of those that are left of a colour, from their first springs on.
 
@@ -185,8 +176,8 @@ def solve_forth(
     compliance, pivot = ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES)
     change, factor, length = ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES)
     for at in range(ti.min(LANES, end - first)):
-        start[at] = pieces.segment_start[first + at]
-        count[at] = pieces.segment_start[first + at + 1] - start[at]
+        start[at] = springs.segment_start[first + at]
+        count[at] = springs.segment_start[first + at + 1] - start[at]
         longest = ti.max(longest, count[at])
         i = springs.nodes[2 * start[at]]
         set_column(u, at, nodes.displacement[i])
@@ -220,9 +211,9 @@ def solve_forth(
 
 
 @func
-def solve_back(p: ti.i32, springs: SpringArrays, pieces: Pieces, nodes: Nodes, is_first: ti.i32, work: ThreadWork):
+def solve_back(p: ti.i32, springs: SpringArrays, nodes: Nodes, is_first: ti.i32, work: ThreadWork):
     """The changes of a piece's multipliers from its last spring on, and where nodes move."""
-    first, end = pieces.segment_start[p], pieces.segment_start[p + 1]
+    first, end = springs.segment_start[p], springs.segment_start[p + 1]
     change, factor, after, is_taut = 0.0, 0.0, ti.math.vec3(0.0), 0  # `after`: the push of the spring after the node
     j = springs.nodes[2 * end - 1]
     for k in range(end - first):
@@ -240,15 +231,13 @@ def solve_back(p: ti.i32, springs: SpringArrays, pieces: Pieces, nodes: Nodes, i
             is_taut = 1
         j, after = i, push
     nodes.displacement[j] = nodes.displacement[j] + nodes.inverse_mass[j] * after
-    pieces.is_taut[p] = is_taut
+    work.is_taut[p] = is_taut
 
 
 @func
-def straighten_piece(
-    p: ti.i32, springs: SpringArrays, pieces: Pieces, nodes: Nodes, motion: NodeMotion, dt: ti.f32, work: ThreadWork
-):
+def straighten_piece(p: ti.i32, springs: SpringArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, work: ThreadWork):
     """Solve a piece forth and back; `direction` and `factor` of a spring hold what is solved at its first node."""
-    first, end = pieces.segment_start[p], pieces.segment_start[p + 1]
+    first, end = springs.segment_start[p], springs.segment_start[p + 1]
     e, share, tension = ti.math.vec3(0.0), 0.0, 0.0
     for s in range(first, end + 1):
         i = springs.nodes[ti.min(2 * s, 2 * end - 1)]
@@ -271,7 +260,6 @@ def straighten_piece(
 @large_kernel
 def solve_threads(
     springs: SpringArrays,
-    pieces: Pieces,
     first: ti.i32,
     nodes: Nodes,
     dt: ti.f32,
@@ -288,13 +276,13 @@ def solve_threads(
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
     """
     threads = ti.static(rows if runs_on_gpu() else 1)
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(pieces.piece_of_colour, first, colours, threads)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
             ti.loop_config(block_dim=rows)
             for row in range(begin, end):
                 p, k = row // rows, row % rows
-                s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
+                s, count = springs.segment_start[p] + k, springs.segment_start[p + 1] - springs.segment_start[p]
                 one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
@@ -311,7 +299,7 @@ def solve_threads(
                         before = work.multiplier[s]
                 of_x[k], of_y[k], of_z[k] = n.x, n.y, n.z
                 if k == 0:
-                    pieces.is_taut[p] = 0
+                    work.is_taut[p] = 0
                 ti.simt.block.sync()
                 lower, diagonal, upper, missing = 0.0, 1.0, 0.0, 0.0
                 if k < count:
@@ -343,21 +331,20 @@ def solve_threads(
                     work.multiplier[s] = before + change
                     work.tension[s] = tension_to_turn(-(before + change) / length, w_i + w_j)
                     if work.tension[s] > 0.0:
-                        pieces.is_taut[p] = 1
+                        work.is_taut[p] = 1
                 ti.simt.block.sync()
         else:
             for place in range((end - begin + LANES - 1) // LANES * LEAST_RUN):
                 if place % LEAST_RUN == 0:
                     p = begin + place // LEAST_RUN * LANES
-                    solve_forth(p, end, springs, pieces, nodes, dt, is_first, work)
+                    solve_forth(p, end, springs, nodes, dt, is_first, work)
                     for side_by_side in range(p, ti.min(p + LANES, end)):
-                        solve_back(side_by_side, springs, pieces, nodes, is_first, work)
+                        solve_back(side_by_side, springs, nodes, is_first, work)
 
 
 @large_kernel
 def straighten_threads(
     springs: SpringArrays,
-    pieces: Pieces,
     first: ti.i32,
     nodes: Nodes,
     motion: NodeMotion,
@@ -373,17 +360,17 @@ def straighten_threads(
     spring from node i on.
     """
     threads = ti.static(rows if runs_on_gpu() else 1)
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(pieces.piece_of_colour, first, colours, threads)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
             ti.loop_config(block_dim=rows)
             for row in range(begin, end):
                 p, k = row // rows, row % rows
-                s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
+                s, count = springs.segment_start[p] + k, springs.segment_start[p + 1] - springs.segment_start[p]
                 one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-                if pieces.is_taut[p]:
+                if work.is_taut[p]:
                     i, before, after, change = -1, 0.0, 0.0, ti.math.vec3(0.0)
                     if k < count:
                         i = springs.nodes[2 * s]
@@ -401,8 +388,8 @@ def straighten_threads(
                         nodes.displacement[i] = nodes.displacement[i] + (turned - change)
         else:
             for p in range(begin, end):
-                if pieces.is_taut[p]:
-                    straighten_piece(p, springs, pieces, nodes, motion, dt, work)
+                if work.is_taut[p]:
+                    straighten_piece(p, springs, nodes, motion, dt, work)
 
 
 @func

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import taichi as ti
 
-from sim.cloth.bundles import Lattice, Nodes, SpringArrays
+from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, sum_over_cells
 from sim.cloth.device_springs import DeviceSprings, coefficient, separation
 from sim.cloth.state import ClothState
@@ -30,17 +30,10 @@ class ClothTotals:
 
     def of_nodes(self, gravity: tuple[float, float, float]) -> dict[str, float]:
         """Momentum, energies but that of springs, largest speed; how many nodes are not finite, and how many lost."""
-        state = self._state
+        state, share = self._state, self._of_nodes.over(self._state.vertex_count)
         results = self._of_nodes.unpack(
             sum_over_nodes(
-                state.position,
-                state.lattice,
-                state.velocity,
-                state.mass,
-                state.vertex_count,
-                state.limit,
-                ti.math.vec3(*gravity),
-                self._of_nodes.over(state.vertex_count),
+                state.nodes, state.motion, state.position, state.mass, state.vertex_count, state.limit, gravity, share
             )
         )
         speed_squared, *sums = (float(value) for value in results)
@@ -66,9 +59,9 @@ class ClothTotals:
 
 @kernel
 def sum_over_nodes(
+    nodes: Nodes,
+    motion: NodeMotion,
     position: Vectors,
-    lattice: Lattice,
-    velocity: Vectors,
     mass: Floats,
     count: ti.i32,
     limit: ti.i32,
@@ -89,7 +82,7 @@ def sum_over_nodes(
         for k in range(share.items):
             i = lane * share.lane_step + k * share.item_step
             if i < count:
-                v_i = velocity[i]
+                v_i = motion.velocity[i]
                 squared = v_i.dot(v_i)
                 if is_finite(squared):
                     fastest = ti.max(fastest, squared)
@@ -98,7 +91,7 @@ def sum_over_nodes(
                     potential -= mass[i] * gravity.dot(position[i])
                 else:
                     bad += 1.0
-                if ti.abs(lattice[i]).max() >= limit:
+                if ti.abs(nodes.lattice[i]).max() >= limit:
                     lost += 1.0
         tree.partial[lane] = fastest
         for axis in ti.static(range(3)):

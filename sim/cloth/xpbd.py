@@ -15,7 +15,7 @@ from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, co
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
 from sim.cloth.triangles import TriangleSolver
-from sim.core.arrays import Integers, Vectors
+from sim.core.arrays import Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, Share, Tree, device_lanes, reduced, runs_on_gpu
@@ -73,13 +73,7 @@ def three(tree: Tree, first: ti.i32) -> ti.math.vec3:
 
 @kernel
 def return_angular_momentum(
-    nodes: Nodes,
-    motion: NodeMotion,
-    dt: ti.f32,
-    first: ti.i32,
-    count: ti.i32,
-    share: Share,
-    turn: Vectors,
+    nodes: Nodes, motion: NodeMotion, dt: ti.f32, first: ti.i32, count: ti.i32, share: Share, turn: Vectors
 ):
     """Rotate the nodes of a cloth so that the corrections of its springs have no angular momentum.
 
@@ -210,28 +204,12 @@ class XPBDSprings:
                 continue
             for colour in springs.first_colours:
                 damp_springs(
-                    springs.on_device,
-                    springs.segment_start,
-                    springs.piece_of_colour,
-                    colour,
-                    state.nodes,
-                    state.motion,
-                    dt,
-                    springs.arity,
-                    springs.first_colours.step,
+                    springs.on_device, colour, state.nodes, state.motion, dt, springs.arity, springs.first_colours.step
                 )
         for cells in self._cells:
             if cells.arity != TRIANGLE and cells.is_damped:
                 for colour in cells.first_colours:
-                    damp_shears(
-                        cells.on_device,
-                        cells.cell_of_colour,
-                        colour,
-                        state.nodes,
-                        state.motion,
-                        dt,
-                        cells.first_colours.step,
-                    )
+                    damp_shears(cells.on_device, colour, state.nodes, state.motion, dt, cells.first_colours.step)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
@@ -255,15 +233,7 @@ class XPBDSprings:
         for cells in solved:
             if not cloths[list(cells.cloths)].any():
                 continue
-            solve_shears(
-                cells.on_device,
-                cells.cell_of_colour,
-                self._state.nodes,
-                dt * dt,
-                int(is_first),
-                cells.multiplier,
-                cells.first_colours.stop,
-            )
+            solve_shears(cells.on_device, self._state.nodes, dt * dt, int(is_first), cells.first_colours.stop)
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
                 threads.displace(self._state, dt, is_first=is_first)
@@ -275,14 +245,7 @@ class XPBDSprings:
         state = self._state
         for colour in springs.first_colours:
             solve_bends(
-                springs.on_device,
-                springs.piece_of_colour,
-                colour,
-                state.nodes,
-                dt * dt,
-                1.0 / dt,
-                springs.arity,
-                springs.first_colours.step,
+                springs.on_device, colour, state.nodes, dt * dt, 1.0 / dt, springs.arity, springs.first_colours.step
             )
 
 
@@ -322,7 +285,6 @@ def solve_bend(s: ti.i32, springs: SpringArrays, nodes: Nodes, dt_squared: ti.f3
 @kernel
 def solve_bends(
     springs: SpringArrays,
-    spring_of_colour: Integers,
     colour: ti.i32,
     nodes: Nodes,
     dt_squared: ti.f32,
@@ -332,7 +294,7 @@ def solve_bends(
 ):
     """The bend springs of so many colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(spring_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
             solve_bend(s, springs, nodes, dt_squared, rate, arity)
@@ -364,8 +326,6 @@ def damp_spring(s: ti.i32, springs: SpringArrays, nodes: Nodes, motion: NodeMoti
 @kernel
 def damp_springs(
     springs: SpringArrays,
-    segment_start: Integers,
-    piece_of_colour: Integers,
     colour: ti.i32,
     nodes: Nodes,
     motion: NodeMotion,
@@ -375,8 +335,8 @@ def damp_springs(
 ):
     """The springs of so many colours, one colour after the other, and one by one within a piece."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(piece_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for piece in range(begin, end):
-            for s in range(segment_start[piece], segment_start[piece + 1]):
+            for s in range(springs.segment_start[piece], springs.segment_start[piece + 1]):
                 damp_spring(s, springs, nodes, motion, dt, arity)

@@ -58,7 +58,7 @@ def test_tension_is_straightened():
     solver._integrator.displace(solver.stable_dt(), np.array([1]))
     with threads_in_float64():
         expected._integrator.displace(expected.stable_dt(), np.array([1]))
-    assert expected._integrator._threads[0]._pieces.is_taut.to_numpy().any()
+    assert expected._integrator._threads[0]._work.is_taut.to_numpy().any()
     moved = expected.state.displacement.to_numpy()
     difference = np.abs(solver.state.displacement.to_numpy() - moved).max()
     assert difference < 1e-3 * np.abs(moved).max()
