@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import taichi as ti
 
-from sim.cloth.bundles import Air, NodeMotion, Nodes
+from sim.cloth.bundles import Air, Nodes
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
@@ -83,7 +83,7 @@ class ClothAir:
         """Accelerate the nodes by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
         state = self._state
         count = state.triangle_count if self.acts else 0
-        predict_in_air(self._on_device, count, state.position, state.nodes, state.motion, gravity, dt)
+        predict_in_air(self._on_device, count, state.position, state.nodes, gravity, dt)
 
 
 @ti.func
@@ -116,13 +116,7 @@ def drag_along(
 
 @kernel
 def predict_in_air(
-    air: Air,
-    triangle_count: ti.i32,
-    position: Vectors,
-    nodes: Nodes,
-    motion: NodeMotion,
-    gravity: ti.math.vec3,
-    dt: ti.f32,
+    air: Air, triangle_count: ti.i32, position: Vectors, nodes: Nodes, gravity: ti.math.vec3, dt: ti.f32
 ):
     """Accelerate nodes by gravity and by their share of the force on each of their triangles; where that leads in dt.
 
@@ -151,8 +145,8 @@ def predict_in_air(
             inverse = ti.rsqrt(squared)
             area = 0.5 * squared * inverse
             normal = inverse * cross
-            mean = air.share[a] * motion.velocity[a] + air.share[b] * motion.velocity[b]
-            mean += air.share[c] * motion.velocity[c]
+            mean = air.share[a] * nodes.velocity[a] + air.share[b] * nodes.velocity[b]
+            mean += air.share[c] * nodes.velocity[c]
             free = 0.0
             for k in ti.static(range(3)):
                 i = air.triangles[t][k]
@@ -177,13 +171,13 @@ def predict_in_air(
     for i in range(count):
         w_i = nodes.inverse_mass[i]
         if w_i > 0.0:
-            v_i = motion.velocity[i] + dt * gravity
+            v_i = nodes.velocity[i] + dt * gravity
             if triangle_count > 0:
                 force = ti.math.vec3(0.0)
                 for k in range(air.triangle_start[i], air.triangle_start[i + 1]):
                     force += air.force[air.triangle_list[k]]
                 v_i += dt * w_i * air.share[i] * force
-            motion.velocity[i] = v_i
-            nodes.displacement[i] = motion.carry[i] + dt * v_i
+            nodes.velocity[i] = v_i
+            nodes.displacement[i] = nodes.carry[i] + dt * v_i
         else:
-            nodes.displacement[i] = motion.carry[i]
+            nodes.displacement[i] = nodes.carry[i]

@@ -35,14 +35,8 @@ class Nodes(NamedTuple):
     quantum: ti.f32  # [m]
     inverse_mass: Floats  # [1/kg], (n,); 0 where a node is pinned
     displacement: Vectors  # from the lattice's position to the end of the substep, `carry` included [m], (n,)
-
-
-@bundle
-class NodeMotion(NamedTuple):
-    """Motion of nodes at the start of a substep."""
-
     carry: Vectors  # what the lattice lacks [m], (n,), at most half a quantum
-    velocity: Vectors  # [m/s], (n,)
+    velocity: Vectors  # at the start of the substep [m/s], (n,)
 
 
 @bundle

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import CellArrays, MeshNodes, NodeMotion, Nodes, Strains
+from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
 from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, set_column
 from sim.cloth.parameters import ClothParameters
@@ -62,10 +62,10 @@ class DeviceCells:
             nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)
             self.mesh.share.from_numpy((weight / np.bincount(nodes, weights=weight)[nodes]).astype(np.float32))
 
-    def measure_strains(self, nodes: Nodes, motion: NodeMotion, *, is_damped: bool) -> None:
-        """Mean strains of the nodes of triangles, as `motion` has carried them, with what damping adds to them."""
+    def measure_strains(self, nodes: Nodes, *, is_damped: bool) -> None:
+        """Mean strains of the nodes of triangles, as they are, with what damping adds to them."""
         if self.arity == TRIANGLE:
-            measure_strains(self.on_device, self.count, self.mesh, self.own, nodes, motion, int(is_damped))
+            measure_strains(self.on_device, self.count, self.mesh, self.own, nodes, int(is_damped))
 
 
 def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
@@ -117,11 +117,11 @@ def derivative(
 
 
 @func
-def velocity_derivative(coefficients: Floats, cells: CellArrays, motion: NodeMotion, s: ti.i32, arity: ti.template()):
+def velocity_derivative(coefficients: Floats, cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()):
     """sum_a c_a v_a [1/s]."""
     rate = ti.math.vec3(0.0)
     for a in ti.static(range(arity)):
-        rate += coefficients[arity * s + a] * motion.velocity[cells.nodes[arity * s + a]]
+        rate += coefficients[arity * s + a] * nodes.velocity[cells.nodes[arity * s + a]]
     return rate
 
 
@@ -221,30 +221,28 @@ def solve_shears(cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: 
 
 
 @func
-def damp_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32):
+def damp_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, dt: ti.f32):
     """Implicit Euler of the force -tau k de/dt of the shear."""
-    d_u = derivative(cells.along, cells, nodes, motion.carry, s, RECTANGLE)
-    d_v = derivative(cells.across, cells, nodes, motion.carry, s, RECTANGLE)
+    d_u = derivative(cells.along, cells, nodes, nodes.carry, s, RECTANGLE)
+    d_v = derivative(cells.across, cells, nodes, nodes.carry, s, RECTANGLE)
     w = weights(cells, nodes, s)
     law = cells.law[s]
-    rate_u = velocity_derivative(cells.along, cells, motion, s, RECTANGLE)
-    rate_v = velocity_derivative(cells.across, cells, motion, s, RECTANGLE)
+    rate_u = velocity_derivative(cells.along, cells, nodes, s, RECTANGLE)
+    rate_v = velocity_derivative(cells.across, cells, nodes, s, RECTANGLE)
     _, by_u, by_v = shear_of(d_u, d_v)
     strength, weight = law[1] * law[3] * dt, weight_along(by_u, by_v, w)
     change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v)) / (strength * weight + 1.0)
-    push_nodes(s, cells, nodes, change * by_u, change * by_v, motion.velocity)
+    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.velocity)
 
 
 @kernel
-def damp_shears(
-    cells: CellArrays, colour: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32, colours: ti.template()
-):
+def damp_shears(cells: CellArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, colours: ti.template()):
     """The cells of so many colours, one colour after the other."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
-            damp_shear(s, cells, nodes, motion, dt)
+            damp_shear(s, cells, nodes, dt)
 
 
 @func
@@ -269,18 +267,16 @@ def tension_of(s: ti.i32, cells: CellArrays, mesh: MeshNodes, strain: Strains, m
 
 
 @kernel
-def measure_strains(
-    cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, motion: NodeMotion, is_damped: ti.i32
-):
+def measure_strains(cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, is_damped: ti.i32):
     """Strains of triangles, with tau times their rates if `is_damped`; then of nodes."""
     for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, motion.carry, s, TRIANGLE)
-        d_v = derivative(cells.across, cells, nodes, motion.carry, s, TRIANGLE)
+        d_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
         length, length_across = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
         mesh.strain[s] = ti.math.vec2(length - 1.0, length_across - 1.0)
         if is_damped:
-            rate_u = d_u.dot(velocity_derivative(cells.along, cells, motion, s, TRIANGLE)) / length
-            rate_v = d_v.dot(velocity_derivative(cells.across, cells, motion, s, TRIANGLE)) / length_across
+            rate_u = d_u.dot(velocity_derivative(cells.along, cells, nodes, s, TRIANGLE)) / length
+            rate_v = d_v.dot(velocity_derivative(cells.across, cells, nodes, s, TRIANGLE)) / length_across
             mesh.strain[s] = mesh.strain[s] + cells.law[s][3] * ti.math.vec2(rate_u, rate_v)
     for k in range(own):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
@@ -288,23 +284,16 @@ def measure_strains(
 
 @kernel
 def compute_cell_forces(
-    cells: CellArrays,
-    mesh: MeshNodes,
-    nodes: Nodes,
-    motion: NodeMotion,
-    first: ti.i32,
-    count: ti.i32,
-    arity: ti.template(),
-    force: Vectors,
+    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, first: ti.i32, count: ti.i32, arity: ti.template(), force: Vectors
 ):
     """-dW/dd_u and -dW/dd_v of each cell with damping [N m], one after the other from `first` on, after
     `measure_strains`.
     """
     for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
-        d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
-        rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
-        rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
+        d_u = derivative(cells.along, cells, nodes, nodes.carry, s, arity)
+        d_v = derivative(cells.across, cells, nodes, nodes.carry, s, arity)
+        rate_u = velocity_derivative(cells.along, cells, nodes, s, arity)
+        rate_v = velocity_derivative(cells.across, cells, nodes, s, arity)
         law = cells.law[s]
         shear, by_u, by_v = shear_of(d_u, d_v)
         moment = -law[1] * (shear + law[3] * (by_u.dot(rate_u) + by_v.dot(rate_v)))
@@ -319,7 +308,7 @@ def compute_cell_forces(
 
 @kernel
 def sum_over_cells(
-    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
+    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, count: ti.i32, arity: ti.template(), share: Share
 ) -> Results:
     """Largest mean strain of nodes of triangles along warp and weft; elastic energy; after `measure_strains`."""
     if ti.static(not runs_on_gpu()):
@@ -330,8 +319,8 @@ def sum_over_cells(
         for k in range(share.items):
             s = lane * share.lane_step + k * share.item_step
             if s < count:
-                d_u = derivative(cells.along, cells, nodes, carry, s, arity)
-                d_v = derivative(cells.across, cells, nodes, carry, s, arity)
+                d_u = derivative(cells.along, cells, nodes, nodes.carry, s, arity)
+                d_v = derivative(cells.across, cells, nodes, nodes.carry, s, arity)
                 law = cells.law[s]
                 shear, _, _ = shear_of(d_u, d_v)
                 energy += 0.5 * law[1] * shear * shear

@@ -261,7 +261,7 @@ class ClothSolver:
             nonlocal at_end
             if excess is None:
                 at_end = integrator.excess(dt)
-            finish_step(state.nodes, state.motion, state.position, state.limit, dt, reasons)
+            finish_step(state.nodes, state.position, state.limit, dt, reasons)
 
         if self.contacts is None or not self.contacts.resolve(state, dt, relax, conclude):
             conclude(self._no_reasons)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import NodeMotion, Nodes, Surface
+from sim.cloth.bundles import Nodes, Surface
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import RestSheet
 from sim.cloth.springs import edges_of
@@ -103,7 +103,7 @@ class ClothState:
 
     Attributes:
         host: what they started with, on the host.
-        nodes, motion, surface: arrays for kernels; each also an attribute of its own.
+        nodes, surface: arrays for kernels; each also an attribute of its own.
         elastic: by how much triangles of meshes displaced nodes in the last step [m], (n,) vec3; 0 elsewhere.
         mass: of a node [kg], (n,), pinned or not.
         body: cloth of a node, (n,) int32.
@@ -127,10 +127,8 @@ class ClothState:
         self.quantum = quantum_of(reach)
         self.limit = int(reach / self.quantum)
         self.nodes: Nodes = with_room(Nodes, n, quantum=self.quantum)
-        self.motion: NodeMotion = with_room(NodeMotion, n)
         self.surface: Surface = with_room(Surface, n, displacement=self.nodes.displacement)
-        self.lattice, _, self.inverse_mass, self.displacement = self.nodes
-        self.carry, self.velocity = self.motion
+        self.lattice, _, self.inverse_mass, self.displacement, self.carry, self.velocity = self.nodes
         self.position, _, self.thickness, self.friction = self.surface
         self.elastic = ti.Vector.ndarray(3, ti.f32, n)
         self.mass = ti.ndarray(ti.f32, n)
@@ -175,7 +173,7 @@ class ClothState:
 
     def place_displaced(self) -> None:
         """Follow the lattice with what is derived from it: float32 positions, and displacements of nothing yet."""
-        round_positions(self.nodes, self.carry, self.position)
+        round_positions(self.nodes, self.position)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take mass, thickness, friction and whether they collide with themselves from the cloths' parameters."""
@@ -196,11 +194,11 @@ class ClothState:
 
 
 @kernel
-def round_positions(nodes: Nodes, carry: Vectors, position: Vectors):
+def round_positions(nodes: Nodes, position: Vectors):
     """float32 positions from the lattice; displacements that hold what it lacks."""
     for i in range(nodes.lattice.shape[0]):
         position[i] = ti.cast(nodes.lattice[i], ti.f32) * nodes.quantum
-        nodes.displacement[i] = carry[i]
+        nodes.displacement[i] = nodes.carry[i]
 
 
 LARGEST_MOVE = 2.0**29  # most quanta in a step: a quarter of the lattice, so that integers do not overflow
@@ -224,14 +222,7 @@ def move_pinned(
 
 
 @kernel
-def finish_step(
-    nodes: Nodes,
-    motion: NodeMotion,
-    position: Vectors,
-    limit: ti.i32,
-    dt: ti.f32,
-    reasons: Integers,
-):
+def finish_step(nodes: Nodes, position: Vectors, limit: ti.i32, dt: ti.f32, reasons: Integers):
     """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
 
     A velocity changes by what the displacement differs from dt times itself: the same as the displacement over dt, but
@@ -243,7 +234,7 @@ def finish_step(
     end = ti.select(reasons[0] + reasons[1] + reasons[2] == 0, position.shape[0], 0)
     for i in range(end):
         u_i = nodes.displacement[i]
-        v_i = motion.velocity[i] + (u_i - (motion.carry[i] + dt * motion.velocity[i])) / dt
+        v_i = nodes.velocity[i] + (u_i - (nodes.carry[i] + dt * nodes.velocity[i])) / dt
         for axis in ti.static(range(3)):
             if is_finite(u_i[axis]):
                 quanta = ti.round(u_i[axis] / nodes.quantum)
@@ -256,9 +247,9 @@ def finish_step(
                     v_i[axis] = 0.0
                 nodes.lattice[i][axis] = place
                 position[i][axis] = ti.cast(place, ti.f32) * nodes.quantum
-                motion.carry[i][axis] = rest
-        motion.velocity[i] = v_i
-        nodes.displacement[i] = motion.carry[i]
+                nodes.carry[i][axis] = rest
+        nodes.velocity[i] = v_i
+        nodes.displacement[i] = nodes.carry[i]
 
 
 class NodeLoad:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import taichi as ti
 
-from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays, ThreadWork
+from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
 from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers
@@ -89,14 +89,7 @@ class ThreadSolver:
         springs = self.springs
         for colour in springs.first_colours:
             straighten_threads(
-                springs.on_device,
-                colour,
-                state.nodes,
-                state.motion,
-                dt,
-                self._work,
-                self._rows,
-                springs.first_colours.step,
+                springs.on_device, colour, state.nodes, dt, self._work, self._rows, springs.first_colours.step
             )
 
     def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
@@ -123,11 +116,11 @@ def tension_to_turn(stress, weight):
 
 
 @func
-def corrected(i: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32) -> ti.math.vec3:
+def corrected(i: ti.i32, nodes: Nodes, dt: ti.f32) -> ti.math.vec3:
     """By how much springs have changed the displacement of a node so far; by nothing if it is pinned."""
     change = ti.math.vec3(0.0)
     if nodes.inverse_mass[i] > 0.0:
-        change = nodes.displacement[i] - (motion.carry[i] + dt * motion.velocity[i])
+        change = nodes.displacement[i] - (nodes.carry[i] + dt * nodes.velocity[i])
     return change
 
 
@@ -235,13 +228,13 @@ def solve_back(p: ti.i32, springs: SpringArrays, nodes: Nodes, is_first: ti.i32,
 
 
 @func
-def straighten_piece(p: ti.i32, springs: SpringArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, work: ThreadWork):
+def straighten_piece(p: ti.i32, springs: SpringArrays, nodes: Nodes, dt: ti.f32, work: ThreadWork):
     """Solve a piece forth and back; `direction` and `factor` of a spring hold what is solved at its first node."""
     first, end = springs.segment_start[p], springs.segment_start[p + 1]
     e, share, tension = ti.math.vec3(0.0), 0.0, 0.0
     for s in range(first, end + 1):
         i = springs.nodes[ti.min(2 * s, 2 * end - 1)]
-        change, w_i = corrected(i, nodes, motion, dt), nodes.inverse_mass[i]
+        change, w_i = corrected(i, nodes, dt), nodes.inverse_mass[i]
         pull = w_i * tension
         tension = ti.select(s < end, work.tension[ti.min(s, end - 1)], 0.0)
         pivot = 1.0 / (1.0 + w_i * tension + pull * (1.0 - share))
@@ -254,7 +247,7 @@ def straighten_piece(p: ti.i32, springs: SpringArrays, nodes: Nodes, motion: Nod
         s = end - 1 - k
         i = springs.nodes[2 * s]
         e = work.direction[s] + work.factor[s] * e
-        nodes.displacement[i] = nodes.displacement[i] + (e - corrected(i, nodes, motion, dt))
+        nodes.displacement[i] = nodes.displacement[i] + (e - corrected(i, nodes, dt))
 
 
 @large_kernel
@@ -347,7 +340,6 @@ def straighten_threads(
     springs: SpringArrays,
     first: ti.i32,
     nodes: Nodes,
-    motion: NodeMotion,
     dt: ti.f32,
     work: ThreadWork,
     rows: ti.template(),
@@ -378,7 +370,7 @@ def straighten_threads(
                     elif k == count:
                         i = springs.nodes[2 * s - 1]
                     if i >= 0:
-                        change = corrected(i, nodes, motion, dt)
+                        change = corrected(i, nodes, dt)
                         if k > 0:
                             before = nodes.inverse_mass[i] * work.tension[s - 1]
                     turned = reduced_row(
@@ -389,7 +381,7 @@ def straighten_threads(
         else:
             for p in range(begin, end):
                 if work.is_taut[p]:
-                    straighten_piece(p, springs, nodes, motion, dt, work)
+                    straighten_piece(p, springs, nodes, dt, work)
 
 
 @func

@@ -85,7 +85,7 @@ class TriangleSolver:
         """
         system, state = self._system, self._state
         share = self._sums.over(system.own)
-        linearize(system, state.nodes, state.carry, dt)
+        linearize(system, state.nodes, dt)
         begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share)
         self._left = 1.0
         if is_first:
@@ -200,15 +200,15 @@ def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.ve
 
 
 @kernel
-def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32):
+def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32):
     """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
 
     Damping adds tau times the rate at which the prediction strains.
     """
     cells, mesh, frames, work = ti.static((system.cells, system.mesh, system.frames, system.work))
     for s in range(system.count):
-        start_u = derivative(cells.along, cells, nodes, carry, s, TRIANGLE)
-        start_v = derivative(cells.across, cells, nodes, carry, s, TRIANGLE)
+        start_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
+        start_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
         d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
         d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
         rate = cells.law[s][3] / dt
@@ -278,14 +278,7 @@ def sum_products(system: TriangleSystem, product: Vectors, share: Share):
 
 
 @kernel
-def begin_iteration(
-    system: TriangleSystem,
-    nodes: Nodes,
-    elastic: Vectors,
-    dt: ti.f32,
-    is_first: ti.i32,
-    share: Share,
-):
+def begin_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, dt: ti.f32, is_first: ti.i32, share: Share):
     """Residual at the start, and inverse blocks; in the first solve of a step the start is a multiple of `elastic`, and
     that is 0 from there on.
     """

@@ -8,7 +8,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
+from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
 from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
@@ -60,7 +60,7 @@ class AngularMomentumCorrection:
             first, end = (int(node) for node in state.host.first_node[cloth : cloth + 2])
             count = end - first if state.is_free[cloth] else 0
             share = Share(lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._tree)
-            return_angular_momentum(state.nodes, state.motion, dt, first, count, share, self._turn)
+            return_angular_momentum(state.nodes, dt, first, count, share, self._turn)
         self._is_warm = True
 
 
@@ -72,9 +72,7 @@ def three(tree: Tree, first: ti.i32) -> ti.math.vec3:
 
 
 @kernel
-def return_angular_momentum(
-    nodes: Nodes, motion: NodeMotion, dt: ti.f32, first: ti.i32, count: ti.i32, share: Share, turn: Vectors
-):
+def return_angular_momentum(nodes: Nodes, dt: ti.f32, first: ti.i32, count: ti.i32, share: Share, turn: Vectors):
     """Rotate the nodes of a cloth so that the corrections of its springs have no angular momentum.
 
     Moments are about the first node; `turn` becomes the rotation, and the centre of mass from there.
@@ -92,7 +90,7 @@ def return_angular_momentum(
                 i = first + n
                 m_i = 1.0 / nodes.inverse_mass[i]
                 r_i = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[first], ti.f32)
-                e_i = nodes.displacement[i] - (motion.carry[i] + dt * motion.velocity[i])
+                e_i = nodes.displacement[i] - (nodes.carry[i] + dt * nodes.velocity[i])
                 mass += m_i
                 moment += m_i * r_i
                 squares += m_i * r_i * r_i
@@ -203,13 +201,11 @@ class XPBDSprings:
             if springs.arity > PAIR or not springs.is_damped:
                 continue
             for colour in springs.first_colours:
-                damp_springs(
-                    springs.on_device, colour, state.nodes, state.motion, dt, springs.arity, springs.first_colours.step
-                )
+                damp_springs(springs.on_device, colour, state.nodes, dt, springs.arity, springs.first_colours.step)
         for cells in self._cells:
             if cells.arity != TRIANGLE and cells.is_damped:
                 for colour in cells.first_colours:
-                    damp_shears(cells.on_device, colour, state.nodes, state.motion, dt, cells.first_colours.step)
+                    damp_shears(cells.on_device, colour, state.nodes, dt, cells.first_colours.step)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
@@ -301,7 +297,7 @@ def solve_bends(
 
 
 @func
-def damp_spring(s: ti.i32, springs: SpringArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, arity: ti.template()):
+def damp_spring(s: ti.i32, springs: SpringArrays, nodes: Nodes, dt: ti.f32, arity: ti.template()):
     """Implicit Euler of the force -tau k dC/dt along a spring."""
     strength = springs.law[s][1] * springs.law[s][2] * dt
     d = separation(springs, nodes, s, arity)
@@ -310,28 +306,20 @@ def damp_spring(s: ti.i32, springs: SpringArrays, nodes: Nodes, motion: NodeMoti
     for a in ti.static(range(arity)):
         c_a = coefficient(springs, s, arity, a)
         i = springs.nodes[arity * s + a]
-        d += c_a * motion.carry[i]
-        rate += c_a * motion.velocity[i]
+        d += c_a * nodes.carry[i]
+        rate += c_a * nodes.velocity[i]
         weight += c_a * c_a * nodes.inverse_mass[i]
     squared = d.dot(d)
     if squared > TINY_LENGTH * TINY_LENGTH:
         impulse = -strength / (strength * weight + 1.0) * d.dot(rate) / squared * d
         for a in ti.static(range(arity)):
             i = springs.nodes[arity * s + a]
-            motion.velocity[i] = (
-                motion.velocity[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
-            )
+            nodes.velocity[i] = nodes.velocity[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
 
 
 @kernel
 def damp_springs(
-    springs: SpringArrays,
-    colour: ti.i32,
-    nodes: Nodes,
-    motion: NodeMotion,
-    dt: ti.f32,
-    arity: ti.template(),
-    colours: ti.template(),
+    springs: SpringArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, arity: ti.template(), colours: ti.template()
 ):
     """The springs of so many colours, one colour after the other, and one by one within a piece."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
@@ -339,4 +327,4 @@ def damp_springs(
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for piece in range(begin, end):
             for s in range(springs.segment_start[piece], springs.segment_start[piece + 1]):
-                damp_spring(s, springs, nodes, motion, dt, arity)
+                damp_spring(s, springs, nodes, dt, arity)

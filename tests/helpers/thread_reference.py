@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sim.cloth import threads
-from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays, ThreadWork
+from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
 from sim.cloth.threads import LEAST_ALIKE, STRAIGHTENED, TURNED_EXPLICITLY
 
 Floats = NDArray[np.float64]
@@ -69,14 +69,13 @@ def straighten_threads(
     springs: SpringArrays,
     first: int,
     nodes: Nodes,
-    motion: NodeMotion,
     dt: float,
     work: ThreadWork,
     _rows: int,
     colours: int,
 ) -> None:
     w, u, tension = (read(array) for array in (nodes.inverse_mass, nodes.displacement, work.tension))
-    predicted = read(motion.carry) + dt * read(motion.velocity)
+    predicted = read(nodes.carry) + dt * read(nodes.velocity)
     for piece, own, chain in pieces_of(springs, first, colours):
         if work.is_taut[piece]:
             change = np.where(w[chain, None] > 0.0, u[chain] - predicted[chain], 0.0)
