@@ -6,13 +6,12 @@ from itertools import pairwise
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
 from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, set_column
 from sim.cloth.parameters import ClothParameters
+from sim.cloth.sheet import pieces_of
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
@@ -72,9 +71,7 @@ def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
     """The nodes of triangles, connected piece by piece; how many nodes, chunks and pieces."""
     triangles = cells.nodes if cells.arity == TRIANGLE else np.zeros((0, TRIANGLE), dtype=np.int32)
     count = int(triangles.max(initial=-1)) + 1
-    a, b, c = triangles.T
-    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
-    label = connected_components(links, directed=False)[1] if count else np.zeros(0, dtype=np.int32)
+    label = pieces_of(triangles)
     used = np.unique(triangles)
     own = used[np.argsort(label[used], kind="stable")]
     piece = np.unique(label[own], return_inverse=True)[1]

@@ -47,7 +47,7 @@ class Patches:
     """
 
     def __init__(self, host: HostCloths) -> None:
-        triangles, edges = host.triangles, host.edges
+        triangles, edges = host.triangles, host.edges.nodes
         patch = _patch_of_triangles(host)
         self.count = int(patch.max()) + 1 if len(patch) else 0
         self.vertex_count = len(host.position)
@@ -65,10 +65,8 @@ class Patches:
         self.first_vertex = on_device(_starts(np.sort(owner), self.count))
         self.vertices = on_device(np.argsort(owner, kind="stable"))
 
-        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
-        number = np.searchsorted(_key(edges, len(owner)), _key(sides, len(owner)))
         edge_owner = np.full(len(edges), self.count)
-        np.minimum.at(edge_owner, number, np.repeat(patch, 3))
+        np.minimum.at(edge_owner, host.edges.of_side, np.repeat(patch, 3))
         self.first_edge = on_device(_starts(np.sort(edge_owner), self.count))
         self.edges = on_device(edges[np.argsort(edge_owner, kind="stable")])
         self.cloth = on_device(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
@@ -103,12 +101,6 @@ def _starts(patch: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Where each of the patches begins among values in their order; and the number of all, (count + 1,)."""
     starts: NDArray[np.int64] = np.concatenate([[0], np.cumsum(np.bincount(patch, minlength=count))])
     return starts
-
-
-def _key(pairs: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """A number for each pair of vertices, in the order of sorted pairs."""
-    key: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
-    return key
 
 
 class ElementBlocks:

@@ -68,12 +68,12 @@ class SelfCollision:
         self._ends, self._taken = ti.ndarray(ti.i32, 4), ti.ndarray(ti.i32, 4)
         self.with_triangles, self.of_edges = (
             PairList(capacity=capacity, pieces=self.patch_pairs.capacity, ends=self._ends, number=number)
-            for number, capacity in enumerate((state.vertex_count, state.edge_count))
+            for number, capacity in enumerate((state.vertex_count, len(state.host.edges.nodes)))
         )
-        edges = state.host.position[state.host.edges]
+        edges = state.host.position[state.host.edges.nodes]
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
         self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
-        cloth_of = state.host.body[state.host.edges[:, 0]]
+        cloth_of = state.host.body[state.host.edges.nodes[:, 0]]
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
         self._nothing = on_device(np.zeros(3, dtype=np.int32))
         self.outcome = self._nothing

@@ -219,6 +219,18 @@ def _nodes_of(vertices: Vectors, nodes: Vectors) -> Indices:
     return numbers
 
 
+def pieces_of(triangles: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Number of the connected piece that each node belongs to, up to the last that a triangle has, (n,)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = int(triangles.max(initial=-1)) + 1
+    a, b, c = triangles.T
+    links = coo_array((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
+    label: NDArray[np.int32] = connected_components(links, directed=False)[1] if count else np.zeros(0, dtype=np.int32)
+    return label
+
+
 def triangle_areas(vertices: Vectors, triangles: NDArray[np.integer]) -> NDArray[np.float64]:
     """Area of each triangle [m²], (k,)."""
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)

@@ -21,7 +21,7 @@ spring stands for, half on the border):
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -97,69 +97,40 @@ class Springs:
 def springs_of(sheet: RestSheet) -> list[Springs]:
     """All springs of a sheet, in the order in which they are solved."""
     if sheet.grid is not None:
-        return [_grid_bends(sheet.grid), _grid_threads(sheet.grid)]
+        return [_along_lines(sheet.grid, 1.0, -2.0, 1.0), _along_lines(sheet.grid, 1.0, -1.0)]
     return [_mesh_bends(sheet)]
 
 
 # --- rectangles ----------------------------------------------------------------------------------------------------
 
 
-def _grid_threads(grid: Grid) -> Springs:
-    """Along x, then along y, thread by thread; colours alternate along each thread from piece to piece."""
-    groups, pieces = [], 0
-    for axis, along, step, of_thread in _directions(grid):
-        width = np.broadcast_to(of_thread, (len(along), along.shape[1] - 1))
-        piece = np.arange(along.shape[1] - 1) // SEGMENT_LENGTH
-        nodes = np.stack([along[:, :-1], along[:, 1:]], axis=-1).reshape(-1, 2)
-        count = len(nodes)
-        segment = pieces + np.arange(len(along))[:, None] * (piece[-1] + 1) + piece
-        pieces += len(along) * (int(piece[-1]) + 1)
-        colour = np.broadcast_to(2 * axis + piece % 2, width.shape)
-        groups.append(
-            Springs(
-                nodes,
-                np.tile([1.0, -1.0], (count, 1)),
-                np.full(count, step),
-                (width / step).ravel(),
-                _all((ALONG_X, ALONG_Y)[axis], count),
-                colour.ravel().astype(np.int32),
-                segment.ravel().astype(np.int32),
-            )
-        )
-    return _joined(groups)
+def _along_lines(grid: Grid, *coefficients: float) -> Springs:
+    """Springs of neighbouring nodes along x, then along y, line by line: two of threads, three of bends.
 
-
-def _grid_bends(grid: Grid) -> Springs:
-    """Over each inner node along x, then along y."""
-    groups = []
-    for axis, along, step, of_thread in _directions(grid):
-        width = np.broadcast_to(of_thread, (len(along), max(along.shape[1] - 2, 0)))
-        nodes = np.stack([along[:, :-2], along[:, 1:-1], along[:, 2:]], axis=-1).reshape(-1, 3)
-        count = len(nodes)
-        colour = np.broadcast_to(3 * axis + np.arange(width.shape[1]) % 3, width.shape)
-        groups.append(
-            Springs(
-                nodes,
-                np.tile([1.0, -2.0, 1.0], (count, 1)),
-                np.zeros(count),
-                (width / step**3).ravel(),
-                _all(BEND, count),
-                colour.ravel().astype(np.int32),
-                _all(-1, count),
-            )
-        )
-    return _joined(groups)
-
-
-def _directions(grid: Grid) -> Iterator[tuple[int, Indices, float, Floats]]:
-    """Of x and y: number of the axis, nodes of each thread (threads, nodes), their distance [m], and the width that
-    each thread stands for [m], (threads, 1).
+    Colours of threads alternate along each from piece to piece, those of bends come in turn.
     """
+    groups, pieces, arity, is_thread = [], 0, len(coefficients), len(coefficients) == 2
     number = np.arange(grid.columns * grid.rows, dtype=np.int32).reshape(grid.rows, grid.columns)
-    for axis, along, step, spacing in ((0, number, grid.step_x, grid.step_y), (1, number.T, grid.step_y, grid.step_x)):
-        width = np.full((len(along), 1), spacing)
+    for axis, line, step, spacing in ((0, number, grid.step_x, grid.step_y), (1, number.T, grid.step_y, grid.step_x)):
+        length = max(line.shape[1] - arity + 1, 0)
+        width = np.full((len(line), 1), spacing)
         width[[0, -1]] *= 0.5
-        yield axis, along, step, width
+        of_line, place = np.divmod(np.arange(len(line) * length, dtype=np.int32), max(length, 1))
+        of_each, piece = -(-length // SEGMENT_LENGTH), place // SEGMENT_LENGTH
+        nodes = np.stack([line[:, k : k + length] for k in range(arity)], axis=-1).reshape(-1, arity)
+        groups.append(
+            Springs(
+                nodes,
+                np.tile(coefficients, (len(nodes), 1)),
+                np.full(len(nodes), step if is_thread else 0.0),
+                np.repeat(width / (step if is_thread else step**3), length),
+                _all((ALONG_X, ALONG_Y)[axis] if is_thread else BEND, len(nodes)),
+                2 * axis + piece % 2 if is_thread else 3 * axis + place % 3,
+                pieces + of_line * of_each + piece if is_thread else _all(-1, len(nodes)),
+            )
+        )
+        pieces += len(line) * of_each
+    return _joined(groups)
 
 
 def _all(value: int, count: int) -> Indices:

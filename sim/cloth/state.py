@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import Nodes, Surface
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.sheet import RestSheet
-from sim.cloth.springs import edges_of
+from sim.cloth.sheet import RestSheet, pieces_of
+from sim.cloth.springs import Edges, edges_of
 from sim.cloth.start import quantum_of, start_positions
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import with_room
@@ -35,7 +33,7 @@ class HostCloths:
         node_area: share of the area of each node [m²], (n,).
         uv: coordinates on the sheet at rest [m], (n, 2).
         triangles: (k, 3) int32.
-        edges: of the triangles, each once, the smaller number first, sorted, (e, 2) int32.
+        edges: of the triangles (`springs.Edges`).
         body: cloth of each node, (n,) int32.
         is_connected: of each cloth, whether it is one piece.
     """
@@ -48,7 +46,7 @@ class HostCloths:
     node_area: NDArray[np.float64]
     uv: NDArray[np.float64]
     triangles: NDArray[np.int32]
-    edges: NDArray[np.int32]
+    edges: Edges
     body: NDArray[np.int32]
     is_connected: tuple[bool, ...]
 
@@ -71,9 +69,9 @@ class HostCloths:
             node_area=np.concatenate([sheet.node_area for sheet in sheets]),
             uv=np.concatenate([sheet.uv for sheet in sheets]),
             triangles=triangles,
-            edges=edges_of(triangles).nodes,
+            edges=edges_of(triangles),
             body=np.repeat(np.arange(len(cloths), dtype=np.int32), counts),
-            is_connected=tuple(_is_connected(sheet) for sheet in sheets),
+            is_connected=tuple(not pieces_of(sheet.triangles).any() for sheet in sheets),
         )
 
     def of_nodes(self, values: Sequence[float]) -> NDArray[np.float64]:
@@ -83,14 +81,6 @@ class HostCloths:
     def of_triangles(self, values: Sequence[float]) -> NDArray[np.float64]:
         """A number of each cloth for each of its triangles, (k,)."""
         return np.repeat(np.asarray(values, dtype=np.float64), np.diff(self.first_triangle))
-
-
-def _is_connected(sheet: RestSheet) -> bool:
-    """Whether every node of a sheet can be reached from every other one along triangles."""
-    count = len(sheet.vertices)
-    a, b, c = sheet.triangles.T
-    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
-    return bool(connected_components(links, directed=False, return_labels=False) == 1)
 
 
 class ClothState:
@@ -107,7 +97,7 @@ class ClothState:
         elastic: by how much triangles of meshes displaced nodes in the last step [m], (n,) vec3; 0 elsewhere.
         mass: of a node [kg], (n,), pinned or not.
         body: cloth of a node, (n,) int32.
-        triangles, edges: (k,) ivec3, (e,) ivec2.
+        triangles: (k,) ivec3.
         names: of the cloths.
         self_collision: of each cloth: whether it collides with itself.
         is_free: of each cloth: whether it is one piece, and no pin holds any of its nodes.
@@ -132,7 +122,11 @@ class ClothState:
         self.position, _, self.thickness, self.friction = self.surface
         self.elastic = ti.Vector.ndarray(3, ti.f32, n)
         self.mass = ti.ndarray(ti.f32, n)
-        self.body, self.triangles, self.edges = on_device(host.body), on_device(host.triangles), on_device(host.edges)
+        self.body, self.triangles, self.edges = (
+            on_device(host.body),
+            on_device(host.triangles),
+            on_device(host.edges.nodes),
+        )
         self.self_collision: tuple[bool, ...] = ()
         self.is_free: tuple[bool, ...] = ()
         self.set_positions(host.position)
@@ -152,11 +146,6 @@ class ClothState:
     def triangle_count(self) -> int:
         """Number of triangles."""
         return len(self.host.triangles)
-
-    @property
-    def edge_count(self) -> int:
-        """Number of edges."""
-        return len(self.host.edges)
 
     def set_positions(self, positions: NDArray[np.floating]) -> None:
         """Put all nodes at world positions [m], (n, 3)."""

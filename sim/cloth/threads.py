@@ -65,19 +65,10 @@ class ThreadSolver:
 
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
-        springs = self.springs
-        springs.contract(state.nodes, state.displacement)
+        springs, nodes, step = self.springs, state.nodes, self.springs.first_colours.step
+        springs.contract(nodes, state.displacement)
         for colour in springs.first_colours:
-            solve_threads(
-                springs.on_device,
-                colour,
-                state.nodes,
-                dt,
-                int(is_first),
-                self._work,
-                self._rows,
-                springs.first_colours.step,
-            )
+            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, self._rows, step)
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for fixed directions.
@@ -86,11 +77,9 @@ class ThreadSolver:
         x + beta (u - u*) for displacements u and those of the prediction u*: (M + beta dt² K) (u - u*) = M (u~ - u*)
         with u~ of the fixed directions, where K is the Laplacian of the thread with weights T/|d|.
         """
-        springs = self.springs
+        springs, step = self.springs, self.springs.first_colours.step
         for colour in springs.first_colours:
-            straighten_threads(
-                springs.on_device, colour, state.nodes, dt, self._work, self._rows, springs.first_colours.step
-            )
+            straighten_threads(springs.on_device, colour, state.nodes, dt, self._work, self._rows, step)
 
     def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
         """Asks for the largest excess of a spring [rest lengths], and how many have not converged
