@@ -20,7 +20,7 @@ from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.cloth.state import ClothState
 from sim.core.bundles import with_room
-from sim.core.host_access import copied
+from sim.core.host_access import copied, take
 from sim.core.reductions import LaneReduction, runs_on_gpu
 
 MORE_ITERATIONS = 16
@@ -160,8 +160,9 @@ class ContinuousContacts:
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Linear and angular impulse on every body since the last call [N s], [N m s], (b, 3) each, for steps of dt."""
-        linear, angular = self.rigid.bodies.take_impulses(self._impulse_unit)
-        return linear / dt, angular / dt
+        bodies = self.rigid.bodies
+        sums = self._impulse_unit * take(bodies.pushed.impulse).astype(np.float64).reshape(-1, 6)[: bodies.count]
+        return sums[:, :3] / dt, sums[:, 3:] / dt
 
     # --- the substep ------------------------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ from sim.cloth.self_collision import Box
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func, with_room
-from sim.core.host_access import copied, put, take
+from sim.core.host_access import copied, put
 from sim.core.launch import kernel, large_kernel
 from sim.core.motion.paths import Poses
 from sim.core.reductions import LaneReduction, Share, reduced
@@ -79,67 +79,6 @@ class CollisionBodies(DeviceShapes):
         if self.count:
             put(self.colliding.friction, friction)
 
-    def set_lift(self, lift: Array) -> None:
-        """Say how much farther than half a thickness vertices keep from each [m], (b,)."""
-        if self.count:
-            put(self.colliding.lift, lift)
-
-    def place(self, poses: Poses, inverse_mass: Array, inverse_inertia: Array) -> None:
-        """Say where the bodies are, and how easily they move.
-
-        Args:
-            poses: of all bodies; further ones are not looked at.
-            inverse_mass: [1/kg], (b,).
-            inverse_inertia: in world axes [1/(kg m²)], (b, 3, 3).
-        """
-        b = self.count
-        if not b:
-            return
-        put(self.colliding.position, poses.position[:b])
-        put(self.colliding.rotation, poses.rotation[:b])
-        put(self.pushed.inverse_mass, inverse_mass)
-        put(self.pushed.inverse_inertia, inverse_inertia)
-        reach = np.array([geometry.radius for geometry in self.geometries])
-        mobility = inverse_mass + reach**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
-        self.pushed = self.pushed._replace(
-            may_move=int(self.pushed.may_move or inverse_mass.any()),
-            load_unit=LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0,
-        )
-
-    def sag(self, edge: float) -> Array:
-        """How far each body shows at most through triangles with such an edge whose vertices touch it [m], (b,).
-
-        What is sharp, or read from a grid, may show by any height.
-        """
-        size, kind = (copied(each)[: self.count] for each in (self.on_device.size, self.on_device.kind))
-        radius = np.where(kind == TORUS, size[:, 1], size[:, 0])
-        return np.where(np.isin(kind, _ROUND), edge**2 / (6.0 * np.maximum(radius, 1.0e-30)), np.inf)
-
-    def look_at_triangles(self, shows: NDArray[np.bool_]) -> None:
-        """Say which bodies may show between vertices, (b,)."""
-        put(self.colliding.shows, np.where(copied(self.on_device.kind)[: self.count] == SPHERE, 1, 2) * shows)
-
-    def set_motion(self, shift: Array, turn: Array) -> None:
-        """Say how the bodies would move in a substep without cloth.
-
-        Args:
-            shift: displacements of the centres of mass [m], (b, 3).
-            turn: rotation vectors [rad], (b, 3).
-        """
-        if self.count:
-            put(self.colliding.motion, np.stack([shift, turn], axis=1).reshape(-1, 3))
-
-    def take_impulses(self, unit: float) -> tuple[Array, Array]:
-        """Linear and angular impulse times the step that cloth gave since the last call [kg m], [kg m²], (b, 3) each.
-
-        Args:
-            unit: of the integers [kg m].
-        """
-        sums = unit * take(self.pushed.impulse).astype(np.float64).reshape(-1, 6)[: self.count]
-        return sums[:, :3], sums[:, 3:]
-
-
-Array = NDArray[np.float64]
 
 PATCHES_AT_A_TIME = 4  # patches that a thread takes at a time: those that touch a body take some microseconds each
 
@@ -162,7 +101,7 @@ SEARCH_LEVELS = 5  # how often the deepest point of a triangle is looked for aro
 AT_CORNER = 0.98  # what has this barycentric coordinate is a vertex
 
 WITH_EDGES = 2
-"""In `CollisionBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one
+"""In `CollidingBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one
 point does not hold it: it turns about that."""
 
 NO_BODIES, BODIES, SHOWN_BODIES = range(3)
@@ -198,8 +137,8 @@ class RigidContact:
     """Finds where cloth touches bodies and walls.
 
     Cloth stays half its thickness away from both. Its vertices are looked at, which keep a little more where a round
-    body would show a little between them (`CollisionBodies.lift`); and where it may show more, as it is sharp, small or
-    thinly covered (`CollisionBodies.sag`), the deepest point of each triangle.
+    body would show a little between them (`CollidingBodies.lift`); and where it may show more, as it is sharp, small or
+    thinly covered, the deepest point of each triangle.
     The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
     by less than `LARGEST_ADVANCE` (`stable_dt`).
 
@@ -241,14 +180,20 @@ class RigidContact:
 
     def set_thickness(self, least: float, largest: float) -> None:
         """Say how thick cloths are at least and at most [m]: where they can be bodies may show between vertices."""
-        missing = self.bodies.sag(self._longest) - 0.5 * (1.0 - OF_TRIANGLES) * least
+        b, shapes, colliding = self.bodies.count, self.bodies.on_device, self.bodies.colliding
+        size, kind = (copied(each)[:b] for each in (shapes.size, shapes.kind))
+        radius = np.where(kind == TORUS, size[:, 1], size[:, 0])
+        # How far a body shows at most through triangles whose vertices touch it; what is sharp, or a grid, by any height.
+        sag = np.where(np.isin(kind, _ROUND), self._longest**2 / (6.0 * np.maximum(radius, 1.0e-30)), np.inf)
+        missing = sag - 0.5 * (1.0 - OF_TRIANGLES) * least
         shows = missing > LARGEST_LIFT * least
         lift = np.where(shows, 0.0, np.maximum(missing, 0.0))
-        self.bodies.set_lift(lift)
+        if b:
+            put(colliding.lift, lift)
         self._largest_half = 0.5 * largest + lift.max(initial=0.0)
         if (shows != self._shows).any():
             self._shows = shows
-            self.bodies.look_at_triangles(shows)
+            put(colliding.shows, np.where(kind == SPHERE, 1, 2) * shows)
 
     def place(self, poses: Poses, motion: BodyMotion | None = None) -> None:
         """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
@@ -261,7 +206,17 @@ class RigidContact:
             inverse_mass[:m], inverse_inertia[:m] = motion.inverse_mass, motion.inverse_inertia
             self._velocity[:m] = motion.velocity
             self._spin_speed[:m] = self._radius[:m] * np.linalg.norm(motion.angular_velocity, axis=1)
-        self.bodies.place(poses, inverse_mass, inverse_inertia)
+        if b:
+            colliding, pushed = self.bodies.colliding, self.bodies.pushed
+            put(colliding.position, poses.position[:b])
+            put(colliding.rotation, poses.rotation[:b])
+            put(pushed.inverse_mass, inverse_mass)
+            put(pushed.inverse_inertia, inverse_inertia)
+            mobility = inverse_mass + self._radius**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
+            self.bodies.pushed = pushed._replace(
+                may_move=int(pushed.may_move or inverse_mass.any()),
+                load_unit=LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0,
+            )
 
     def begin_substep(self, dt: float) -> None:
         """Foresee how the bodies move in a substep of dt [s] that cloth does not push."""
@@ -271,7 +226,8 @@ class RigidContact:
             shift, turn = np.zeros((b, 3)), np.zeros((b, 3))
             shift[:m] = dt * (motion.velocity + dt * motion.acceleration)
             turn[:m] = dt * motion.angular_velocity
-            self.bodies.set_motion(shift, turn)
+            if b:
+                put(self.bodies.colliding.motion, np.stack([shift, turn], axis=1).reshape(-1, 3))
 
     def stable_dt(self, state: ClothState, nodes: range, box: Box, *, at_most: float) -> float:
         """Largest step [s] for some nodes, of one cloth or of several.
