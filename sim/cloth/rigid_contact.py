@@ -183,7 +183,7 @@ class RigidContact:
         b, shapes, colliding = self.bodies.count, self.bodies.on_device, self.bodies.colliding
         size, kind = (copied(each)[:b] for each in (shapes.size, shapes.kind))
         radius = np.where(kind == TORUS, size[:, 1], size[:, 0])
-        # How far a body shows at most through triangles whose vertices touch it; what is sharp, or a grid, by any height.
+        # How far it shows at most through triangles whose vertices touch it; what is sharp, or a grid, by any height.
         sag = np.where(np.isin(kind, _ROUND), self._longest**2 / (6.0 * np.maximum(radius, 1.0e-30)), np.inf)
         missing = sag - 0.5 * (1.0 - OF_TRIANGLES) * least
         shows = missing > LARGEST_LIFT * least
