@@ -362,7 +362,7 @@ class PairLists(NamedTuple):
 
 @bundle
 class EdgeBlocks(NamedTuple):
-    """Edges of patches in blocks; see `ElementBlocks`."""
+    """Edges of patches in blocks; see `patches.blocks_of`."""
 
     first_block: Integers  # of each patch, (m + 1,)
     edges: Pairs
@@ -376,7 +376,7 @@ class EdgeBlocks(NamedTuple):
 
 @bundle
 class TriangleBlocks(NamedTuple):
-    """Triangles of patches in blocks; see `ElementBlocks`."""
+    """Triangles of patches in blocks; see `patches.blocks_of`."""
 
     first_block: Integers  # of each patch, (m + 1,)
     triangles: Triples

@@ -10,7 +10,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import EdgeBlocks, PatchElements, PatchNodes, TriangleBlocks
+from sim.cloth.bundles import EdgeBlocks, PatchBlocks, PatchElements, PatchNodes, TriangleBlocks
 from sim.cloth.state import HostCloths
 from sim.core.arrays import on_device
 from sim.core.reductions import runs_on_gpu
@@ -103,25 +103,16 @@ def _starts(patch: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return starts
 
 
-class ElementBlocks:
+def blocks_of(patches: Patches) -> PatchBlocks:
     """Edges and triangles of each patch in whole blocks, which are filled up with elements that are far from all.
 
     One array for each component, and blocks of a length that the compiler knows: so it compares eight elements in an
-    instruction, where it took one after another from arrays of vectors.
-
-    Attributes:
-        edges: first block of each patch, (m + 1,); ends of the edges, (p,) ivec2, `NONE` in places that only fill up;
-            then x, y, z of their midpoints, and half their vectors [m], (p,) each.
-        triangles: first block of each patch, (m + 1,); corners, (q,) ivec3; then their boxes' lowest x, y, z, and
-            highest [m], (q,) each.
-
-    Args:
-        patches: of the cloths.
+    instruction, where it took one after another from arrays of vectors. `NONE` is in places that only fill up.
     """
-
-    def __init__(self, patches: Patches) -> None:
-        self.edges = EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
-        self.triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
+    triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
+    return PatchBlocks(
+        patches.vertex_lists, triangles, EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
+    )
 
 
 def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:
