@@ -19,7 +19,6 @@ and every loop its time to compile."""
 
 TINY_LENGTH = 1.0e-12  # springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there
 
-
 LANES = 8
 """Springs that a thread of a CPU solves side by side: numbers of a vector unit of 256 bits. Local blocks have as many
 columns."""

@@ -155,7 +155,7 @@ def solve_forth(
     u, x, n = ti.Matrix.zero(ti.f32, 3, LANES), ti.Matrix.zero(ti.i32, 3, LANES), ti.Matrix.zero(ti.f32, 3, LANES)
     before, after = ti.Matrix.zero(ti.f32, 3, LANES), ti.Matrix.zero(ti.f32, 3, LANES)
     w_i, w_j, missing = ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES)
-    compliance, pivot = ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES)
+    compliance, pivot = ti.Vector.zero(ti.f32, LANES) + 1.0, ti.Vector.zero(ti.f32, LANES)  # as without a spring
     change, factor, length = ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES)
     for at in range(ti.min(LANES, end - first)):
         start[at] = springs.segment_start[first + at]
