@@ -217,29 +217,22 @@ def solve_shears(cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: 
                     solve_shear(s, end, cells, nodes, dt_squared, start, lanes)
 
 
-@func
-def damp_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, dt: ti.f32):
-    """Implicit Euler of the force -tau k de/dt of the shear."""
-    d_u = derivative(cells.along, cells, nodes, nodes.carry, s, RECTANGLE)
-    d_v = derivative(cells.across, cells, nodes, nodes.carry, s, RECTANGLE)
-    w = weights(cells, nodes, s)
-    law = cells.law[s]
-    rate_u = velocity_derivative(cells.along, cells, nodes, s, RECTANGLE)
-    rate_v = velocity_derivative(cells.across, cells, nodes, s, RECTANGLE)
-    _, by_u, by_v = shear_of(d_u, d_v)
-    strength, weight = law[1] * law[3] * dt, weight_along(by_u, by_v, w)
-    change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v)) / (strength * weight + 1.0)
-    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.velocity)
-
-
 @kernel
 def damp_shears(cells: CellArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, colours: ti.template()):
-    """The cells of so many colours, one colour after the other."""
+    """Implicit Euler of the forces -tau k de/dt of the shear of so many colours, one after the other."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
-            damp_shear(s, cells, nodes, dt)
+            d_u = derivative(cells.along, cells, nodes, nodes.carry, s, RECTANGLE)
+            d_v = derivative(cells.across, cells, nodes, nodes.carry, s, RECTANGLE)
+            rate_u = velocity_derivative(cells.along, cells, nodes, s, RECTANGLE)
+            rate_v = velocity_derivative(cells.across, cells, nodes, s, RECTANGLE)
+            _, by_u, by_v = shear_of(d_u, d_v)
+            strength = cells.law[s][1] * cells.law[s][3] * dt
+            change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v))
+            change /= strength * weight_along(by_u, by_v, weights(cells, nodes, s)) + 1.0
+            push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.velocity)
 
 
 @func

@@ -149,7 +149,7 @@ class XPBDSprings:
     """
 
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
-        self._state, self._springs, self._cells = state, springs, cells
+        self._state = state
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
         self._bends = [family for family in springs if family.arity > PAIR]
@@ -197,20 +197,19 @@ class XPBDSprings:
         come first in the sweep, and what gravity predicts does not bend the cloth; they are damped there.
         """
         state = self._state
-        for springs in self._springs:
-            if springs.arity > PAIR or not springs.is_damped:
-                continue
+        for springs in (threads.springs for threads in self._threads if threads.springs.is_damped):
             for colour in springs.first_colours:
-                damp_springs(springs.on_device, colour, state.nodes, dt, springs.arity, springs.first_colours.step)
-        for cells in self._cells:
-            if cells.arity != TRIANGLE and cells.is_damped:
-                for colour in cells.first_colours:
-                    damp_shears(cells.on_device, colour, state.nodes, dt, cells.first_colours.step)
+                damp_threads(springs.on_device, colour, state.nodes, dt, springs.first_colours.step)
+        for cells in (each for each in self._shears if each.is_damped):
+            for colour in cells.first_colours:
+                damp_shears(cells.on_device, colour, state.nodes, dt, cells.first_colours.step)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
-        for springs in self._bends:
-            self._solve_bends(springs, dt)
+        for bends in self._bends:
+            step, nodes = bends.first_colours.step, self._state.nodes
+            for colour in bends.first_colours:
+                solve_bends(bends.on_device, colour, nodes, dt * dt, 1.0 / dt, bends.arity, step)
         for sweep in range(sweeps.max()):
             self._sweep_lists(self._shears, dt, sweeps > sweep, is_first=sweep == 0)
         for threads in self._threads:
@@ -236,13 +235,6 @@ class XPBDSprings:
         for triangles in self._triangles:
             if cloths[list(triangles.cloths)].any():
                 triangles.displace(dt, is_first=is_first)
-
-    def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
-        state = self._state
-        for colour in springs.first_colours:
-            solve_bends(
-                springs.on_device, colour, state.nodes, dt * dt, 1.0 / dt, springs.arity, springs.first_colours.step
-            )
 
 
 @func
@@ -296,35 +288,21 @@ def solve_bends(
             solve_bend(s, springs, nodes, dt_squared, rate, arity)
 
 
-@func
-def damp_spring(s: ti.i32, springs: SpringArrays, nodes: Nodes, dt: ti.f32, arity: ti.template()):
-    """Implicit Euler of the force -tau k dC/dt along a spring."""
-    strength = springs.law[s][1] * springs.law[s][2] * dt
-    d = separation(springs, nodes, s, arity)
-    rate = ti.math.vec3(0.0)
-    weight = 0.0
-    for a in ti.static(range(arity)):
-        c_a = coefficient(springs, s, arity, a)
-        i = springs.nodes[arity * s + a]
-        d += c_a * nodes.carry[i]
-        rate += c_a * nodes.velocity[i]
-        weight += c_a * c_a * nodes.inverse_mass[i]
-    squared = d.dot(d)
-    if squared > TINY_LENGTH * TINY_LENGTH:
-        impulse = -strength / (strength * weight + 1.0) * d.dot(rate) / squared * d
-        for a in ti.static(range(arity)):
-            i = springs.nodes[arity * s + a]
-            nodes.velocity[i] = nodes.velocity[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
-
-
 @kernel
-def damp_springs(
-    springs: SpringArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, arity: ti.template(), colours: ti.template()
-):
-    """The springs of so many colours, one colour after the other, and one by one within a piece."""
+def damp_threads(springs: SpringArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, colours: ti.template()):
+    """Implicit Euler of the forces -tau k dC/dt along the springs of so many colours, one colour after the other, and
+    one by one within a piece.
+    """
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for piece in range(begin, end):
             for s in range(springs.segment_start[piece], springs.segment_start[piece + 1]):
-                damp_spring(s, springs, nodes, dt, arity)
+                i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+                w_i, w_j, v_i, v_j = nodes.inverse_mass[i], nodes.inverse_mass[j], nodes.velocity[i], nodes.velocity[j]
+                d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
+                d += nodes.carry[i] - nodes.carry[j]
+                squared, strength = d.dot(d), springs.law[s][1] * springs.law[s][2] * dt
+                if squared > TINY_LENGTH * TINY_LENGTH:
+                    impulse = -strength / (strength * (w_i + w_j) + 1.0) * d.dot(v_i - v_j) / squared * d
+                    nodes.velocity[i], nodes.velocity[j] = v_i + w_i * impulse, v_j - w_j * impulse
