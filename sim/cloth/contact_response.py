@@ -30,13 +30,12 @@ from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import large_kernel
 from sim.core.reductions import runs_on_gpu
+from sim.core.warps import add_to, largest_in_warp, whole_warps
 
 Given = ti.types.vector(6, ti.i64)
 """What a body gets of contacts, in their units: impulse and moment."""
 
-AT_A_TIME = 16
-"""Contacts whose impulses on a body a thread sums up by itself: those of a body are neighbours in the list, and threads
-that add to one number wait for each other."""
+AT_A_TIME = 64  # contacts whose impulses on a body a thread of a CPU sums up by itself
 
 
 @func
@@ -98,6 +97,20 @@ def give(given: Given, body: ti.i32, body_gathered: LongIntegers):
     if body >= 0:
         for axis in ti.static(range(6)):
             ti.atomic_add(body_gathered[6 * body + axis], given[axis])
+
+
+@ti.func
+def give_body_together(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers, item: ti.i32):
+    """The same where all threads of a warp call it, for body -1 where there is none: one addition for most of them."""
+    common = largest_in_warp(body)
+    if body >= 0 and body != common:
+        give_body(push, body, arm, body_gathered)
+    if common >= 0:
+        own = ti.cast(body == common, ti.f32)
+        p, twist = own * push, own * arm.cross(push)
+        for axis in ti.static(range(3)):
+            add_to(body_gathered, 6 * common + axis, -ti.round(p[axis], ti.i64), item)
+            add_to(body_gathered, 6 * common + 3 + axis, -ti.round(twist[axis], ti.i64), item)
 
 
 @ti.func
@@ -206,7 +219,7 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     """
     contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end = contacts.counter[3], vertex_count
+    contacts_end, vertices_end, weighed_end = contacts.counter[3], vertex_count, whole_warps(contacts.counter[3])
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
@@ -256,27 +269,33 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
                 of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
                 own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
                 nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
-    for first in range(contacts_end):
-        if first % AT_A_TIME != 0:
+    for first in range(weighed_end):
+        # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
+        if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
             continue
         given_body, given = -1, Given(0)
-        for c in range(first, ti.min(first + AT_A_TIME, contacts_end)):
-            if impulses.mobility[c] > 0.0:
+        for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
+            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
+            if c < contacts_end and impulses.mobility[c] > 0.0:
                 if is_first == 1:
                     impulses.impulse[c] = ti.math.vec3(0.0)
                 v = contacts.vertices[c][0]
                 if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
                     impulses.mobility[c] = nodes.inverse_mass[v]
-                    if contacts.kind[c] != given_body:
-                        give(given, given_body, bodies.impulse)
-                        given_body, given = contacts.kind[c], Given(0)
-                    given += opposite_of(settle(c, r), contacts.arm[c])
+                    push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
                     if sums.counter[4] == 0:
                         sums.counter[4] = 1
                 else:
                     place = ti.atomic_add(sums.counter[0], 1)
                     impulses.pushing[place] = c
                     impulses.mobility[c] = weighed(c, place, r)
+            if ti.static(runs_on_gpu()):
+                give_body_together(push, body, arm, bodies.impulse, c)
+            elif body >= 0:
+                if body != given_body:
+                    give(given, given_body, bodies.impulse)
+                    given_body, given = body, Given(0)
+                given += opposite_of(push, arm)
         give(given, given_body, bodies.impulse)
 
 
