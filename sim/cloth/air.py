@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import taichi as ti
 
-from sim.cloth.bundles import Air, NodeMotion, Nodes
+from sim.cloth.bundles import Air, Nodes
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
@@ -14,10 +14,7 @@ from sim.core.bundles import with_room
 from sim.core.launch import kernel
 from sim.core.parameters import KeyRefusedError, Vector3
 
-WIND = -1
-"""Source of air that is nothing but the wind of a cloth's parameters."""
-
-Triangles = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
+WIND = -1  # source of air that is nothing but the wind of a cloth's parameters
 
 
 class ClothAir:
@@ -27,16 +24,10 @@ class ClothAir:
     per area of cloth, feels the opposite impulse, and is never pushed beyond the cloth's velocity.
 
     Attributes:
-        velocity: of the air at each triangle [m/s], (k,) vec3.
-        inverse_mass: area of cloth over the mass of the air that it acts on [m²/kg], (k,); 0 for wind.
+        velocity, inverse_mass, force, impulse, share, triangle_start, triangle_list: see `bundles.Air`.
         source: number of what the air belongs to, (k,) int32; `WIND` for wind.
         density: of the air [kg/m³], (k,); 0 where it drags nothing.
-        force: of the air on each triangle in the last substep [N], (k,) vec3.
-        impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3.
         wind: of the parameters [m/s], (k,) vec3.
-        share: of each node in the force on any of its triangles [-], (n,).
-        triangle_start: the triangles of node i are `triangle_list[triangle_start[i]:triangle_start[i + 1]]`.
-        triangle_list: in ascending order of the nodes, then of the triangles.
         acts: whether any cloth has air that drags.
         is_shared: whether a coupling puts air there, of which there is one for all cloths.
     """
@@ -58,7 +49,8 @@ class ClothAir:
         around = np.bincount(triangles.ravel(), weights=np.repeat(triangle_areas(host.position, triangles), 3))
         of_nodes = [on_device(each) for each in (host.node_area / around, start, order // 3)]
         self.share, self.triangle_start, self.triangle_list = of_nodes
-        self._on_device: Air = with_room(Air, count, **dict(zip(Air._fields[-3:], of_nodes, strict=True)))
+        of_nodes.append(state.triangles)
+        self._on_device: Air = with_room(Air, count, **dict(zip(Air._fields[-4:], of_nodes, strict=True)))
         self.velocity, self.inverse_mass, self._drag, self.force, self.impulse, *_ = self._on_device
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
@@ -91,17 +83,7 @@ class ClothAir:
         """Accelerate the nodes by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
         state = self._state
         count = state.triangle_count if self.acts else 0
-        predict_in_air(
-            state.position,
-            state.triangles,
-            count,
-            self._on_device,
-            state.nodes,
-            state.motion,
-            state.vertex_count,
-            gravity,
-            dt,
-        )
+        predict_in_air(self._on_device, count, state.position, state.nodes, gravity, dt)
 
 
 @ti.func
@@ -134,15 +116,7 @@ def drag_along(
 
 @kernel
 def predict_in_air(
-    position: Vectors,
-    triangles: Triangles,
-    triangle_count: ti.i32,
-    air: Air,
-    nodes: Nodes,
-    motion: NodeMotion,
-    count: ti.i32,
-    gravity: ti.math.vec3,
-    dt: ti.f32,
+    air: Air, triangle_count: ti.i32, position: Vectors, nodes: Nodes, gravity: ti.math.vec3, dt: ti.f32
 ):
     """Accelerate nodes by gravity and by their share of the force on each of their triangles; where that leads in dt.
 
@@ -160,8 +134,9 @@ def predict_in_air(
     with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
     not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
     """
+    count = position.shape[0]
     for t in range(triangle_count):
-        a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
+        a, b, c = air.triangles[t][0], air.triangles[t][1], air.triangles[t][2]
         x_a = position[a]
         cross = (position[b] - x_a).cross(position[c] - x_a)
         squared = cross.dot(cross)
@@ -170,11 +145,11 @@ def predict_in_air(
             inverse = ti.rsqrt(squared)
             area = 0.5 * squared * inverse
             normal = inverse * cross
-            mean = air.share[a] * motion.velocity[a] + air.share[b] * motion.velocity[b]
-            mean += air.share[c] * motion.velocity[c]
+            mean = air.share[a] * nodes.velocity[a] + air.share[b] * nodes.velocity[b]
+            mean += air.share[c] * nodes.velocity[c]
             free = 0.0
             for k in ti.static(range(3)):
-                i = triangles[t][k]
+                i = air.triangles[t][k]
                 free += ti.select(nodes.inverse_mass[i] > 0.0, air.share[i], 0.0)
             mobility = free * area / air.drag[t][2]
             air_mobility = air.inverse_mass[t]
@@ -196,13 +171,13 @@ def predict_in_air(
     for i in range(count):
         w_i = nodes.inverse_mass[i]
         if w_i > 0.0:
-            v_i = motion.velocity[i] + dt * gravity
+            v_i = nodes.velocity[i] + dt * gravity
             if triangle_count > 0:
                 force = ti.math.vec3(0.0)
                 for k in range(air.triangle_start[i], air.triangle_start[i + 1]):
                     force += air.force[air.triangle_list[k]]
                 v_i += dt * w_i * air.share[i] * force
-            motion.velocity[i] = v_i
-            nodes.displacement[i] = motion.carry[i] + dt * v_i
+            nodes.velocity[i] = v_i
+            nodes.displacement[i] = nodes.carry[i] + dt * v_i
         else:
-            nodes.displacement[i] = motion.carry[i]
+            nodes.displacement[i] = nodes.carry[i]

@@ -33,26 +33,20 @@ class Nodes(NamedTuple):
 
     lattice: Lattice  # where the substep starts, in quanta, (n,)
     quantum: ti.f32  # [m]
-    inverse_mass: Floats  # [1/kg], (n,)
-    displacement: Vectors  # in the substep [m], (n,)
-
-
-@bundle
-class NodeMotion(NamedTuple):
-    """Motion of nodes at the start of a substep."""
-
-    carry: Vectors  # [m], (n,)
-    velocity: Vectors  # [m/s], (n,)
+    inverse_mass: Floats  # [1/kg], (n,); 0 where a node is pinned
+    displacement: Vectors  # from the lattice's position to the end of the substep, `carry` included [m], (n,)
+    carry: Vectors  # what the lattice lacks [m], (n,), at most half a quantum
+    velocity: Vectors  # at the start of the substep [m/s], (n,)
 
 
 @bundle
 class Surface(NamedTuple):
     """Nodes as contacts are looked for."""
 
-    position: Vectors  # at the start of the substep [m], (n,)
+    position: Vectors  # where the substep starts, rounded to float32 [m], (n,)
     displacement: Vectors  # [m], (n,)
-    thickness: Floats  # [m], (n,)
-    friction: Floats  # [-], (n,)
+    thickness: Floats  # distance that layers keep [m], (n,)
+    friction: Floats  # Coulomb's coefficient [-], (n,)
 
 
 @bundle
@@ -65,12 +59,14 @@ class Rest(NamedTuple):
 
 @bundle
 class SpringArrays(NamedTuple):
-    """Springs of one family, s of them."""
+    """Springs of one family, s of them; a piece is one spring where they are solved one by one."""
 
     nodes: Integers  # (arity s,)
     law: Laws  # rest length [m], stiffness [N/m], damping over stiffness [s], (s,)
     coefficients: Floats  # of springs with four nodes, (4 s,)
     shift: Floats  # what springs of threads count as longer, because of the strain across [m], (s,)
+    segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
+    piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
 
 
 @bundle
@@ -81,6 +77,8 @@ class CellArrays(NamedTuple):
     along: Floats  # c_a of d_u [1/m], (arity s,)
     across: Floats  # c_a of d_v [1/m], (arity s,)
     law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
+    cell_of_colour: Integers  # first cell of each colour, and number of cells, (colours + 1,)
+    multiplier: Floats  # of the shear, (s,); rectangles only
 
 
 @bundle
@@ -156,20 +154,15 @@ class Contraction(NamedTuple):
 
 
 @bundle
-class Pieces(NamedTuple):
-    """Pieces of threads."""
-
-    segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
-    piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
-    is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
-
-
-@bundle
 class ThreadWork(NamedTuple):
     """Numbers of each spring of threads within a substep, (s,) each."""
 
     multiplier: Floats
     tension: Floats  # too much of it, over the length
+    direction: Vectors  # along which it pushes; on a CPU, as what follows
+    change: Floats  # of the multiplier, as far as known
+    factor: Floats  # of the change of the spring before
+    is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
 
 
 @bundle
@@ -177,31 +170,14 @@ class Air(NamedTuple):
     """Air at the triangles."""
 
     velocity: Vectors  # [m/s], (k,)
-    inverse_mass: Floats  # area of cloth over mass of air [m²/kg], (k,)
+    inverse_mass: Floats  # area of cloth over mass of the air that it acts on [m²/kg], (k,); 0 for wind
     drag: Vectors  # rho C_n / 2, rho C_t / 2 [kg/m³], mass of the triangle [kg], (k,)
-    force: Vectors  # [N], (k,)
-    impulse: Vectors  # [N s], (k,)
-    share: Floats  # of each node in the force on its triangles [-], (n,)
-    triangle_start: Integers  # of each node in the list, (n + 1,)
+    force: Vectors  # on each triangle in the last substep [N], (k,)
+    impulse: Vectors  # since a coupling set it to zero [N s], (k,)
+    share: Floats  # of each node in the force on any of its triangles [-], (n,)
+    triangle_start: Integers  # of each node in the list, which has triangles in ascending order, (n + 1,)
     triangle_list: Integers
-
-
-# --- rows of rectangles ---------------------------------------------------------------------------------------------
-
-
-@bundle
-class Lines(NamedTuple):
-    """Lines of a rectangle along one direction."""
-
-    count: ti.i32
-    length: ti.i32  # nodes of a line
-    first: ti.i32  # block; 0 of upright ones
-    strips: ti.i32  # blocks beside each other
-    other_first: ti.i32  # those of the other direction
-    other_strips: ti.i32
-    first_node: ti.i32
-    line_step: ti.i32  # from a node to the same of the next line
-    node_step: ti.i32  # from a node to the next one of its line
+    triangles: Triples  # their nodes, (k,)
 
 
 # --- patches --------------------------------------------------------------------------------------------------------
@@ -386,7 +362,7 @@ class PairLists(NamedTuple):
 
 @bundle
 class EdgeBlocks(NamedTuple):
-    """Edges of patches in blocks; see `ElementBlocks`."""
+    """Edges of patches in blocks; see `patches.blocks_of`."""
 
     first_block: Integers  # of each patch, (m + 1,)
     edges: Pairs
@@ -400,7 +376,7 @@ class EdgeBlocks(NamedTuple):
 
 @bundle
 class TriangleBlocks(NamedTuple):
-    """Triangles of patches in blocks; see `ElementBlocks`."""
+    """Triangles of patches in blocks; see `patches.blocks_of`."""
 
     first_block: Integers  # of each patch, (m + 1,)
     triangles: Triples
@@ -507,6 +483,17 @@ class PushedBodies(NamedTuple):
 
 
 @bundle
+class Response(NamedTuple):
+    """Contacts, and what they push."""
+
+    contacts: Contacts
+    impulses: Impulses
+    nodes: PushedNodes
+    sums: NodeSums
+    bodies: PushedBodies
+
+
+@bundle
 class CollidingBodies(NamedTuple):
     """Bodies as cloth looks for them, (b,) each."""
 
@@ -535,3 +522,15 @@ class Walls(NamedTuple):
     high: Vectors
     joined_low: Vectors  # 1 on axes on which another wall joins it, else 0
     joined_high: Vectors
+
+
+@bundle
+class Touching(NamedTuple):
+    """Cloth, and what it may touch besides itself."""
+
+    surface: Surface
+    inverse_mass: Floats  # of nodes [1/kg], (n,)
+    walls: Walls
+    bodies: CollidingBodies
+    recovery: ti.f32  # share of a missing distance that the substep gives back [-]
+    contacts: Contacts  # which what touches is appended to

@@ -77,8 +77,7 @@ class Cells:
         )
 
 
-TRIANGLE, RECTANGLE = 3, 4
-"""Nodes of cells."""
+TRIANGLE, RECTANGLE = 3, 4  # nodes of cells
 
 OWN_SHARE = 0.05
 """Of the stiffness of triangles, that each has by itself: at none, single ones are strained by 11 % where cotton folds

@@ -23,7 +23,7 @@ than its friction would let them.
 
 import taichi as ti
 
-from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, PushedNodes
+from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, Response
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import INACTIVE, WALL
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
@@ -35,30 +35,29 @@ from sim.core.warps import add_to, largest_in_warp, whole_warps
 Given = ti.types.vector(6, ti.i64)
 """What a body gets of contacts, in their units: impulse and moment."""
 
-AT_A_TIME = 64
-"""Contacts whose impulses on a body a thread of a CPU sums up by itself."""
+AT_A_TIME = 64  # contacts whose impulses on a body a thread of a CPU sums up by itself
 
 
 @func
-def relative_displacement(c: ti.i32, contacts: Contacts, displacement: Vectors, body_motion: Vectors) -> ti.math.vec3:
+def relative_displacement(c: ti.i32, r: Response) -> ti.math.vec3:
     """Of the first side of a contact against the second, or against the body [m]."""
+    (contacts,) = ti.static((r.contacts,))
     w = ti.math.vec3(0.0)
     for k in ti.static(range(4)):
         if contacts.weights[c][k] != 0.0:
-            w += contacts.weights[c][k] * displacement[contacts.vertices[c][k]]
+            w += contacts.weights[c][k] * r.nodes.displacement[contacts.vertices[c][k]]
     b = contacts.kind[c]
     if b >= 0:
-        w -= body_motion[2 * b] + body_motion[2 * b + 1].cross(contacts.arm[c])
+        w -= r.bodies.motion[2 * b] + r.bodies.motion[2 * b + 1].cross(contacts.arm[c])
     return w
 
 
 @func
-def answered(
-    c: ti.i32, ahead: ti.math.vec3, contacts: Contacts, impulses: Impulses, displacement: Vectors, body_motion: Vectors
-) -> ti.math.vec3:
+def answered(c: ti.i32, ahead: ti.math.vec3, r: Response) -> ti.math.vec3:
     """The impulse of a contact that has one, by which displacements lead, after a step of the residual over D."""
+    contacts, impulses = ti.static((r.contacts, r.impulses))
     n = contacts.normal[c]
-    w = relative_displacement(c, contacts, displacement, body_motion)
+    w = relative_displacement(c, r)
     along = ti.max(ahead.dot(n) + (contacts.floor[c] - w.dot(n)) / impulses.mobility[c], 0.0)
     sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / impulses.mobility[c]
     held, length = contacts.friction[c] * along, sideways.norm()
@@ -67,10 +66,13 @@ def answered(
     return along * n + sideways
 
 
-@ti.func
-def body_mobility(arm: ti.math.vec3, inverse_mass: ti.f32, inverse_inertia: ti.math.mat3) -> ti.f32:
-    """Upper bound of how much a body's point moves per impulse on it [1/kg]."""
-    return inverse_mass + arm.norm_sqr() * ti.math.mat3(inverse_inertia).norm()
+@func
+def body_mobility(c: ti.i32, contacts: Contacts, bodies: PushedBodies) -> ti.f32:
+    """Upper bound of how much a contact's point of a body moves per impulse on it [1/kg]; 0 without a body."""
+    most, b = 0.0, contacts.kind[c]
+    if b >= 0:
+        most = bodies.inverse_mass[b] + contacts.arm[c].norm_sqr() * ti.math.mat3(bodies.inverse_inertia[b]).norm()
+    return most
 
 
 @ti.func
@@ -117,8 +119,7 @@ def thickness_between(vertices: ti.types.vector(4, ti.i32), thickness: Floats) -
     return 0.5 * (thickness[vertices[0]] + thickness[vertices[3]])
 
 
-SHARES_PER_UNIT = 65536.0
-"""Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
+SHARES_PER_UNIT = 65536.0  # resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound
 
 MOST_ALIKE = -0.95
 """A vertex is between two sides, and gets a `support`, if the cosine of the angle of their normals is below this: a
@@ -127,8 +128,7 @@ heavy node that meets the edge of a body obliquely would kick it."""
 LEAST_COSINE = 0.86
 """Contacts are turned to the support of their vertices if the cosine of the angle between both lines is larger."""
 
-LEAST_ANSWER = 1.0e-6
-"""Of a vertex that has a support: float32 cannot tell less from none."""
+LEAST_ANSWER = 1.0e-6  # of a vertex that has a support: float32 cannot tell less from none
 
 
 @func
@@ -196,20 +196,11 @@ LEAST_FREE_WEIGHT = 0.05
 """A contact pushes only if its vertices that no pin holds have so much of its weight, so that none moves more than
 twenty times what the contact lacks. Others are only watched: a corner far from a contact of two pins is no lever."""
 
-ALONE = -1
-"""In the place of the first use of a vertex: what stands touches it, and nothing else does."""
+ALONE = -1  # in the place of the first use of a vertex: what stands touches it, and nothing else does
 
 
 @large_kernel
-def weigh_contacts(
-    contacts: Contacts,
-    impulses: Impulses,
-    vertex_count: ti.i32,
-    nodes: PushedNodes,
-    sums: NodeSums,
-    bodies: PushedBodies,
-    is_first: ti.i32,
-):
+def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     """List the contacts that push, and compute their diagonal D; before the first round of what was found, forget their
     impulses, and keep what displacements were `predicted` as it was looked for.
 
@@ -226,6 +217,7 @@ def weigh_contacts(
     If bodies may move, each vertex between what stands and a body that moves gets its `support`, and its contacts a
     normal along that, from `held_sums`, `lever` and `pressing_body`.
     """
+    contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, vertices_end, weighed_end = contacts.counter[3], vertex_count, whole_warps(contacts.counter[3])
     all_end = ti.max(vertex_count, bodies.count)
@@ -253,13 +245,10 @@ def weigh_contacts(
                     ti.atomic_add(nodes.uses[2 * contacts.vertices[c][k] + 1], 1)
                     if nodes.inverse_mass[contacts.vertices[c][k]] > 0.0:
                         free += ti.abs(contacts.weights[c][k])
-            b = contacts.kind[c]
-            most = 0.0
-            if b >= 0:
-                most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
-                if most > 0.0:
-                    ti.atomic_add(bodies.load[b], ti.cast(ti.ceil(ti.sqrt(most) / bodies.load_unit), ti.i64))
-                    free = 1.0
+            b, most = contacts.kind[c], body_mobility(c, contacts, bodies)
+            if most > 0.0:
+                ti.atomic_add(bodies.load[b], ti.cast(ti.ceil(ti.sqrt(most) / bodies.load_unit), ti.i64))
+                free = 1.0
             if is_of_vertex_and_what_stands(c, contacts, bodies):
                 ti.atomic_add(nodes.uses[2 * contacts.vertices[c][0]], 1)
             if bodies.may_move == 1 and (b >= 0 or b == WALL):
@@ -293,13 +282,13 @@ def weigh_contacts(
                 v = contacts.vertices[c][0]
                 if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
                     impulses.mobility[c] = nodes.inverse_mass[v]
-                    push, body, arm = settle(c, contacts, impulses, nodes, bodies), contacts.kind[c], contacts.arm[c]
+                    push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
                     if sums.counter[4] == 0:
                         sums.counter[4] = 1
                 else:
                     place = ti.atomic_add(sums.counter[0], 1)
                     impulses.pushing[place] = c
-                    impulses.mobility[c] = weighed(c, place, contacts, impulses, nodes, sums, bodies)
+                    impulses.mobility[c] = weighed(c, place, r)
             if ti.static(runs_on_gpu()):
                 give_body_together(push, body, arm, bodies.impulse, c)
             elif body >= 0:
@@ -311,16 +300,9 @@ def weigh_contacts(
 
 
 @func
-def weighed(
-    c: ti.i32,
-    place: ti.i32,
-    contacts: Contacts,
-    impulses: Impulses,
-    nodes: PushedNodes,
-    sums: NodeSums,
-    bodies: PushedBodies,
-) -> ti.f32:
+def weighed(c: ti.i32, place: ti.i32, r: Response) -> ti.f32:
     """The diagonal D of a contact, which gets its place among the uses of its vertices, and its normal."""
+    contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
     if bodies.may_move == 1 and (contacts.kind[c] >= 0 or contacts.kind[c] == WALL):
         contacts.normal[c] = turned_to_support(c, contacts, nodes.support)
     total = 0.0
@@ -332,51 +314,38 @@ def weighed(
             total += answer_of(nodes.support[v]) * own
             use = ti.atomic_add(nodes.uses[2 * v + 1], 1)
             impulses.used_by[use], impulses.use_weight[use] = place, contacts.weights[c][k]
-    b = contacts.kind[c]
-    if b >= 0:
-        most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
-        total += ti.sqrt(most) * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
+    if contacts.kind[c] >= 0:
+        load = ti.cast(bodies.load[contacts.kind[c]], ti.f32) * bodies.load_unit
+        total += ti.sqrt(body_mobility(c, contacts, bodies)) * load
     return total
 
 
 @func
 def is_of_vertex_and_what_stands(c: ti.i32, contacts: Contacts, bodies: PushedBodies) -> ti.u1:
     """Whether a contact is one of a single vertex with a wall, or with a body that no push moves."""
-    b = contacts.kind[c]
-    stands = b == WALL
-    if b >= 0:
-        stands = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b]) == 0.0
-    return stands and contacts.weights[c][0] == 1.0
+    is_against = contacts.kind[c] >= 0 or contacts.kind[c] == WALL
+    return is_against and body_mobility(c, contacts, bodies) == 0.0 and contacts.weights[c][0] == 1.0
 
 
 @func
-def settle(c: ti.i32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies) -> ti.math.vec3:
+def settle(c: ti.i32, r: Response) -> ti.math.vec3:
     """Push the only vertex of a contact, which has no other, by all that it lacks; returns that, in units."""
-    v, before = contacts.vertices[c][0], impulses.impulse[c]
-    after = answered(c, before, contacts, impulses, nodes.displacement, bodies.motion)
+    impulses, nodes = ti.static((r.impulses, r.nodes))
+    v, before = r.contacts.vertices[c][0], impulses.impulse[c]
+    after = answered(c, before, r)
     push = (after - before) / impulses.unit
     impulses.impulse[c] = after
     nodes.displacement[v] += (nodes.inverse_mass[v] * impulses.unit) * ti.round(push)
     return push
 
 
-STEPS = 8
-"""Steps of the iteration in one launch: what all iterations have at least."""
+STEPS = 8  # steps of the iteration in one launch: what all iterations have at least
 
 Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
 
 @func
-def push_apart(
-    momenta: Momenta,
-    starts: ti.i32,
-    count: ti.i32,
-    touched_count: ti.i32,
-    contacts: Contacts,
-    impulses: Impulses,
-    nodes: PushedNodes,
-    bodies: PushedBodies,
-):
+def push_apart(momenta: Momenta, starts: ti.i32, count: ti.i32, touched_count: ti.i32, r: Response):
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
     The first launch of an iteration, which `starts` it, notes where that is.
@@ -384,8 +353,8 @@ def push_apart(
     A step starts from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them. It leaves the
     displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
     """
-    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, touched_end = count, touched_count
+    impulses, nodes, bodies = ti.static((r.impulses, r.nodes, r.bodies))
+    contacts_end, touched_end = count, touched_count  # before the first loop, as below
     moved_end = touched_count + bodies.count
     new_end = starts * ti.max(count, touched_count, bodies.count)
     for place in range(new_end):
@@ -403,32 +372,27 @@ def push_apart(
             impulses.impulse_given[c] = impulses.impulse[c]
     for step in ti.static(range(STEPS)):
         for place in range(contacts_end):
-            push_contact(place, momenta[step], contacts, impulses, nodes, bodies)
+            push_contact(place, momenta[step], r)
         for place in range(moved_end):
             if place < touched_end:
-                move_node(nodes.touched[place], momenta[step + 1], impulses, nodes)
+                move_node(nodes.touched[place], momenta[step + 1], r)
             else:
-                move_body(place - touched_end, momenta[step + 1], impulses, bodies)
+                move_body(place - touched_end, momenta[step + 1], r)
 
 
 @func
-def push_contact(
-    place: ti.i32, momentum: ti.f32, contacts: Contacts, impulses: Impulses, nodes: PushedNodes, bodies: PushedBodies
-):
+def push_contact(place: ti.i32, momentum: ti.f32, r: Response):
     """What a contact gives in a step, from its place in `pushing`."""
+    contacts, impulses, bodies = ti.static((r.contacts, r.impulses, r.bodies))
     c = impulses.pushing[place]
     ahead = impulses.impulse[c] + momentum * (impulses.impulse[c] - impulses.impulse_before[c])
-    after = answered(c, ahead, contacts, impulses, nodes.displacement, bodies.motion)
+    after = answered(c, ahead, r)
     impulses.impulse_before[c] = impulses.impulse[c]
     impulses.impulse[c] = after
     impulses.push[place] = (after - ahead) / impulses.unit
     # What nothing moves need not hear of it before the end: its sums are in the way of all threads.
-    b = contacts.kind[c]
-    most = 0.0
-    if b >= 0 and (after - ahead).norm_sqr() > 0.0:
-        most = body_mobility(contacts.arm[c], bodies.inverse_mass[b], bodies.inverse_inertia[b])
-    if most > 0.0:
-        give_body(impulses.push[place], b, contacts.arm[c], bodies.gathered)
+    if (after - ahead).norm_sqr() > 0.0 and body_mobility(c, contacts, bodies) > 0.0:
+        give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
 
 
 @func
@@ -442,8 +406,9 @@ def given_to(i: ti.i32, uses: Integers, impulses: Impulses) -> ti.math.vec3:
 
 
 @func
-def move_node(i: ti.i32, momentum: ti.f32, impulses: Impulses, nodes: PushedNodes):
+def move_node(i: ti.i32, momentum: ti.f32, r: Response):
     """Displace a vertex by what its contacts give it in a step, and ahead by the momentum of the next."""
+    impulses, nodes = ti.static((r.impulses, r.nodes))
     given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
     u = nodes.displacement[i] + (nodes.inverse_mass[i] * impulses.unit) * given
     nodes.displacement[i] = u + momentum * (u - nodes.reached[i])
@@ -451,10 +416,11 @@ def move_node(i: ti.i32, momentum: ti.f32, impulses: Impulses, nodes: PushedNode
 
 
 @func
-def move_body(b: ti.i32, momentum: ti.f32, impulses: Impulses, bodies: PushedBodies):
+def move_body(b: ti.i32, momentum: ti.f32, r: Response):
     """The same of a body."""
-    shift = bodies.motion[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(bodies.gathered, 6 * b)
-    turn = bodies.motion[2 * b + 1] + impulses.unit * (bodies.inverse_inertia[b] @ take(bodies.gathered, 6 * b + 3))
+    (bodies,) = ti.static((r.bodies,))
+    shift = bodies.motion[2 * b] + (bodies.inverse_mass[b] * r.impulses.unit) * take(bodies.gathered, 6 * b)
+    turn = bodies.motion[2 * b + 1] + r.impulses.unit * (bodies.inverse_inertia[b] @ take(bodies.gathered, 6 * b + 3))
     bodies.motion[2 * b] = shift + momentum * (shift - bodies.motion_reached[2 * b])
     bodies.motion[2 * b + 1] = turn + momentum * (turn - bodies.motion_reached[2 * b + 1])
     bodies.motion_reached[2 * b] = shift
@@ -472,20 +438,12 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
 
 
 @func
-def finish_push(
-    finishes: ti.i32,
-    count: ti.i32,
-    touched_count: ti.i32,
-    contacts: Contacts,
-    impulses: Impulses,
-    nodes: PushedNodes,
-    bodies: PushedBodies,
-):
+def finish_push(finishes: ti.i32, count: ti.i32, touched_count: ti.i32, r: Response):
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
     Nothing where it does not finish yet: a kernel with it and one without would be compiled, for seconds each.
     """
-    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
     contacts_end, touched_end, bodies_end = finishes * count, finishes * touched_count, finishes * bodies.count
     for place in range(contacts_end):
         c = impulses.pushing[place]
@@ -508,35 +466,25 @@ def finish_push(
         bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
 
 
-TOLERANCE = 0.02
-"""Part of their thickness by which contacts may miss what they should keep."""
+TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they should keep
 
 
 @large_kernel
-def push(
-    momenta: Momenta,
-    starts: ti.i32,
-    finishes: ti.i32,
-    contacts: Contacts,
-    impulses: Impulses,
-    nodes: PushedNodes,
-    sums: NodeSums,
-    thickness: Floats,
-    bodies: PushedBodies,
-) -> ti.math.ivec4:
+def push(momenta: Momenta, starts: ti.i32, finishes: ti.i32, r: Response, thickness: Floats) -> ti.math.ivec4:
     """Some steps of the iteration of a round (`weigh_contacts`), and where they lead if it `finishes`.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
     `TOLERANCE` then, and whether any were settled.
     """
+    contacts, sums = ti.static((r.contacts, r.sums))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
     measured_end = finishes * pushing_count
-    push_apart(momenta, starts, pushing_count, touched_count, contacts, impulses, nodes, bodies)
-    finish_push(finishes, pushing_count, touched_count, contacts, impulses, nodes, bodies)
+    push_apart(momenta, starts, pushing_count, touched_count, r)
+    finish_push(finishes, pushing_count, touched_count, r)
     for place in range(measured_end):
-        c = impulses.pushing[place]
-        w = relative_displacement(c, contacts, nodes.displacement, bodies.motion)
+        c = r.impulses.pushing[place]
+        w = relative_displacement(c, r)
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
             sums.counter[3] = 1

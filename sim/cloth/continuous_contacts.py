@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
@@ -14,24 +13,21 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import NodeSums, PushedNodes
+from sim.cloth.bundles import NodeSums, PushedNodes, Response
 from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
+from sim.cloth.state import ClothState
 from sim.core.bundles import with_room
-from sim.core.host_access import copied
+from sim.core.host_access import copied, take
 from sim.core.reductions import LaneReduction, runs_on_gpu
-
-if TYPE_CHECKING:
-    from sim.cloth.state import ClothState
 
 MORE_ITERATIONS = 16
 """Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
 in stacks and impacts; two layers under their weight need one step."""
 
-REPAIRS = 4
-"""Rounds in which crossing pairs are pushed before they become impact zones."""
+REPAIRS = 4  # rounds in which crossing pairs are pushed before they become impact zones
 
 RECOVERY_TIME_S = 0.01
 """Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""
@@ -101,10 +97,7 @@ class ContinuousContacts:
         asked, self._velocities = self._velocities or box_of(state.velocity, 0, n, self._ends), None
         velocity = asked()
         shortest = self.rigid.stable_dt(
-            state,
-            range(n),
-            velocity,
-            at_most=self._little_motion(velocity, at_most) if self._pairs.meets else at_most,
+            state, range(n), velocity, at_most=self._little_motion(velocity, at_most) if self._pairs.meets else at_most
         )
         if shortest == at_most or len(state.names) == 1:
             return shortest
@@ -167,8 +160,9 @@ class ContinuousContacts:
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Linear and angular impulse on every body since the last call [N s], [N m s], (b, 3) each, for steps of dt."""
-        linear, angular = self.rigid.bodies.take_impulses(self._impulse_unit)
-        return linear / dt, angular / dt
+        bodies = self.rigid.bodies
+        sums = self._impulse_unit * take(bodies.pushed.impulse).astype(np.float64).reshape(-1, 6)[: bodies.count]
+        return sums[:, :3] / dt, sums[:, 3:] / dt
 
     # --- the substep ------------------------------------------------------------------------------------------------
 
@@ -289,30 +283,18 @@ class ContinuousContacts:
 
     def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
         """A round of the first `STEPS` steps; asks for what `push` returns."""
-        weigh_contacts(
-            self._contacts.found,
-            self._contacts.impulses(self._impulse_unit),
-            state.vertex_count,
-            self._pushed,
-            self._sums,
-            self.rigid.bodies.pushed,
-            int(is_first),
-        )
+        weigh_contacts(self._response, state.vertex_count, int(is_first))
         return self._push_on(state, 0, finishes=True)
 
     def _push_on(self, state: ClothState, first: int, *, finishes: bool) -> Callable[[], list[int]]:
         """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
-        return push.later(
-            _momenta_from(first),
-            int(first == 0),
-            int(finishes),
-            self._contacts.found,
-            self._contacts.impulses(self._impulse_unit),
-            self._pushed,
-            self._sums,
-            state.thickness,
-            self.rigid.bodies.pushed,
-        )
+        momenta = _momenta_from(first)
+        return push.later(momenta, int(first == 0), int(finishes), self._response, state.thickness)
+
+    @property
+    def _response(self) -> Response:
+        impulses = self._contacts.impulses(self._impulse_unit)
+        return Response(self._contacts.found, impulses, self._pushed, self._sums, self.rigid.bodies.pushed)
 
     def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
         """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""

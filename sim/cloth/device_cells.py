@@ -6,16 +6,15 @@ from itertools import pairwise
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import CellArrays, MeshNodes, NodeMotion, Nodes, Strains
+from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
-from sim.cloth.device_springs import TINY_LENGTH, colour_bounds, colour_groups
+from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, set_column
 from sim.cloth.parameters import ClothParameters
-from sim.core.arrays import Floats, Integers, Vectors, on_device
+from sim.cloth.sheet import pieces_of
+from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import func
-from sim.core.launch import kernel
+from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 
 SHEAR_SWEEPS = 3
@@ -37,8 +36,6 @@ class DeviceCells:
         first_colours: as of `DeviceSprings`.
         mesh: nodes of triangles; nothing of rectangles.
         own, chunks, pieces: how many nodes, chunks and pieces those are.
-        cell_of_colour: first cell of each colour, and number of cells, (colours + 1,).
-        multiplier: of the shear, (count,); rectangles only.
     """
 
     def __init__(self, cells: Cells, cloth_of: NDArray[np.int32]) -> None:
@@ -47,11 +44,11 @@ class DeviceCells:
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
         self.is_damped = False
-        self.first_colours, self.cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
-        self.multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
+        self.first_colours, cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
+        multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
         self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
         listed = (on_device(each.ravel()) for each in (cells.nodes, cells.along, cells.across))
-        self.on_device = CellArrays(*listed, ti.Vector.ndarray(4, ti.f32, self.count))
+        self.on_device = CellArrays(*listed, ti.Vector.ndarray(4, ti.f32, self.count), cell_of_colour, multiplier)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
@@ -64,19 +61,17 @@ class DeviceCells:
             nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)
             self.mesh.share.from_numpy((weight / np.bincount(nodes, weights=weight)[nodes]).astype(np.float32))
 
-    def measure_strains(self, nodes: Nodes, motion: NodeMotion, *, is_damped: bool) -> None:
-        """Mean strains of the nodes of triangles, as `motion` has carried them, with what damping adds to them."""
+    def measure_strains(self, nodes: Nodes, *, is_damped: bool) -> None:
+        """Mean strains of the nodes of triangles, as they are, with what damping adds to them."""
         if self.arity == TRIANGLE:
-            measure_strains(self.on_device, self.count, self.mesh, self.own, nodes, motion, int(is_damped))
+            measure_strains(self.on_device, self.count, self.mesh, self.own, nodes, int(is_damped))
 
 
 def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
     """The nodes of triangles, connected piece by piece; how many nodes, chunks and pieces."""
     triangles = cells.nodes if cells.arity == TRIANGLE else np.zeros((0, TRIANGLE), dtype=np.int32)
     count = int(triangles.max(initial=-1)) + 1
-    a, b, c = triangles.T
-    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
-    label = connected_components(links, directed=False)[1] if count else np.zeros(0, dtype=np.int32)
+    label = pieces_of(triangles)
     used = np.unique(triangles)
     own = used[np.argsort(label[used], kind="stable")]
     piece = np.unique(label[own], return_inverse=True)[1]
@@ -119,11 +114,11 @@ def derivative(
 
 
 @func
-def velocity_derivative(coefficients: Floats, cells: CellArrays, motion: NodeMotion, s: ti.i32, arity: ti.template()):
+def velocity_derivative(coefficients: Floats, cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()):
     """sum_a c_a v_a [1/s]."""
     rate = ti.math.vec3(0.0)
     for a in ti.static(range(arity)):
-        rate += coefficients[arity * s + a] * motion.velocity[cells.nodes[arity * s + a]]
+        rate += coefficients[arity * s + a] * nodes.velocity[cells.nodes[arity * s + a]]
     return rate
 
 
@@ -165,14 +160,7 @@ def weight_along(by_u: ti.math.vec3, by_v: ti.math.vec3, w: ti.math.vec3):
 
 
 @func
-def push_nodes(
-    s: ti.i32,
-    cells: CellArrays,
-    nodes: Nodes,
-    p_u: ti.math.vec3,
-    p_v: ti.math.vec3,
-    changed: Vectors,
-):
+def push_nodes(s: ti.i32, cells: CellArrays, nodes: Nodes, p_u: ti.math.vec3, p_v: ti.math.vec3, changed: Vectors):
     """Give the nodes of a cell what pushes along d_u and d_v change of displacements or velocities."""
     for a in ti.static(range(RECTANGLE)):
         i = cells.nodes[RECTANGLE * s + a]
@@ -181,70 +169,70 @@ def push_nodes(
 
 
 @func
-def solve_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: ti.i32, multiplier: Floats):
-    """The shear of a cell of a rectangle, by Macklin, Müller & Chentanez 2016, eq. 18, multiplied through by k dt²."""
-    d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, RECTANGLE)
-    d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE)
-    shear, by_u, by_v = shear_of(d_u, d_v)
-    strength = cells.law[s][1] * dt_squared
-    stiffness = strength * weight_along(by_u, by_v, weights(cells, nodes, s))
-    before = ti.select(is_first, 0.0, multiplier[s])
-    change = -over_relaxed(stiffness) * (strength * shear + before) / (stiffness + 1.0)
-    multiplier[s] = before + change
-    push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.displacement)
-
-
-@kernel
-def solve_shears(
+def solve_shear(
+    first: ti.i32,
+    end: ti.i32,
     cells: CellArrays,
-    cell_of_colour: Integers,
     nodes: Nodes,
     dt_squared: ti.f32,
     is_first: ti.i32,
-    multiplier: Floats,
-    colours: ti.template(),
+    lanes: ti.template(),
 ):
+    """The shear of so many cells of a colour side by side, or of those that are left, by Macklin, Müller & Chentanez
+    2016, eq. 18, multiplied through by k dt². See `threads.solve_forth` for lanes.
+    """
+    d_u, d_v, w = ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes)
+    strength, before = ti.Vector.zero(ti.f32, lanes), ti.Vector.zero(ti.f32, lanes)
+    for at in range(lanes):
+        s = first + at
+        if s < end:
+            set_column(d_u, at, derivative(cells.along, cells, nodes, nodes.displacement, s, RECTANGLE))
+            set_column(d_v, at, derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE))
+            set_column(w, at, weights(cells, nodes, s))
+            strength[at], before[at] = cells.law[s][1] * dt_squared, ti.select(is_first, 0.0, cells.multiplier[s])
+    for at in range(lanes):
+        shear, by_u, by_v = shear_of(column(d_u, at), column(d_v, at))
+        stiffness = strength[at] * weight_along(by_u, by_v, column(w, at))
+        change = -over_relaxed(stiffness) * (strength[at] * shear + before[at]) / (stiffness + 1.0)
+        before[at] += change
+        set_column(d_u, at, change * by_u)
+        set_column(d_v, at, change * by_v)
+    for at in range(lanes):
+        if first + at < end:
+            cells.multiplier[first + at] = before[at]
+            push_nodes(first + at, cells, nodes, column(d_u, at), column(d_v, at), nodes.displacement)
+
+
+@large_kernel
+def solve_shears(cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: ti.i32, colours: ti.template()):
     """The cells of all colours, one after the other; if `is_first`, `SHEAR_SWEEPS` times, from multipliers of 0."""
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cell_of_colour, 0, colours, 1)
+    lanes = ti.static(1 if runs_on_gpu() else LANES)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, 0, colours, 1)
     for sweep in ti.static(range(SHEAR_SWEEPS)):
         for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
             for s in range(begin, end):
-                if ti.static(sweep == 0) or is_first == 1:
-                    solve_shear(s, cells, nodes, dt_squared, is_first if ti.static(sweep == 0) else 0, multiplier)
-
-
-@func
-def damp_shear(s: ti.i32, cells: CellArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32):
-    """Implicit Euler of the force -tau k de/dt of the shear."""
-    d_u = derivative(cells.along, cells, nodes, motion.carry, s, RECTANGLE)
-    d_v = derivative(cells.across, cells, nodes, motion.carry, s, RECTANGLE)
-    w = weights(cells, nodes, s)
-    law = cells.law[s]
-    rate_u = velocity_derivative(cells.along, cells, motion, s, RECTANGLE)
-    rate_v = velocity_derivative(cells.across, cells, motion, s, RECTANGLE)
-    _, by_u, by_v = shear_of(d_u, d_v)
-    strength, weight = law[1] * law[3] * dt, weight_along(by_u, by_v, w)
-    change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v)) / (strength * weight + 1.0)
-    push_nodes(s, cells, nodes, change * by_u, change * by_v, motion.velocity)
+                if (s - begin) % lanes == 0 and (ti.static(sweep == 0) or is_first == 1):
+                    start = is_first if ti.static(sweep == 0) else 0
+                    solve_shear(s, end, cells, nodes, dt_squared, start, lanes)
 
 
 @kernel
-def damp_shears(
-    cells: CellArrays,
-    cell_of_colour: Integers,
-    colour: ti.i32,
-    nodes: Nodes,
-    motion: NodeMotion,
-    dt: ti.f32,
-    colours: ti.template(),
-):
-    """The cells of so many colours, one colour after the other."""
+def damp_shears(cells: CellArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, colours: ti.template()):
+    """Implicit Euler of the forces -tau k de/dt of the shear of so many colours, one after the other."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cell_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
-            damp_shear(s, cells, nodes, motion, dt)
+            d_u = derivative(cells.along, cells, nodes, nodes.carry, s, RECTANGLE)
+            d_v = derivative(cells.across, cells, nodes, nodes.carry, s, RECTANGLE)
+            rate_u = velocity_derivative(cells.along, cells, nodes, s, RECTANGLE)
+            rate_v = velocity_derivative(cells.across, cells, nodes, s, RECTANGLE)
+            _, by_u, by_v = shear_of(d_u, d_v)
+            strength = cells.law[s][1] * cells.law[s][3] * dt
+            change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v))
+            change /= strength * weight_along(by_u, by_v, weights(cells, nodes, s)) + 1.0
+            push_nodes(s, cells, nodes, change * by_u, change * by_v, nodes.velocity)
 
 
 @func
@@ -269,24 +257,16 @@ def tension_of(s: ti.i32, cells: CellArrays, mesh: MeshNodes, strain: Strains, m
 
 
 @kernel
-def measure_strains(
-    cells: CellArrays,
-    count: ti.i32,
-    mesh: MeshNodes,
-    own: ti.i32,
-    nodes: Nodes,
-    motion: NodeMotion,
-    is_damped: ti.i32,
-):
+def measure_strains(cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, is_damped: ti.i32):
     """Strains of triangles, with tau times their rates if `is_damped`; then of nodes."""
     for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, motion.carry, s, TRIANGLE)
-        d_v = derivative(cells.across, cells, nodes, motion.carry, s, TRIANGLE)
+        d_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
         length, length_across = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
         mesh.strain[s] = ti.math.vec2(length - 1.0, length_across - 1.0)
         if is_damped:
-            rate_u = d_u.dot(velocity_derivative(cells.along, cells, motion, s, TRIANGLE)) / length
-            rate_v = d_v.dot(velocity_derivative(cells.across, cells, motion, s, TRIANGLE)) / length_across
+            rate_u = d_u.dot(velocity_derivative(cells.along, cells, nodes, s, TRIANGLE)) / length
+            rate_v = d_v.dot(velocity_derivative(cells.across, cells, nodes, s, TRIANGLE)) / length_across
             mesh.strain[s] = mesh.strain[s] + cells.law[s][3] * ti.math.vec2(rate_u, rate_v)
     for k in range(own):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
@@ -294,23 +274,16 @@ def measure_strains(
 
 @kernel
 def compute_cell_forces(
-    cells: CellArrays,
-    mesh: MeshNodes,
-    nodes: Nodes,
-    motion: NodeMotion,
-    first: ti.i32,
-    count: ti.i32,
-    arity: ti.template(),
-    force: Vectors,
+    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, first: ti.i32, count: ti.i32, arity: ti.template(), force: Vectors
 ):
     """-dW/dd_u and -dW/dd_v of each cell with damping [N m], one after the other from `first` on, after
     `measure_strains`.
     """
     for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, motion.carry, s, arity)
-        d_v = derivative(cells.across, cells, nodes, motion.carry, s, arity)
-        rate_u = velocity_derivative(cells.along, cells, motion, s, arity)
-        rate_v = velocity_derivative(cells.across, cells, motion, s, arity)
+        d_u = derivative(cells.along, cells, nodes, nodes.carry, s, arity)
+        d_v = derivative(cells.across, cells, nodes, nodes.carry, s, arity)
+        rate_u = velocity_derivative(cells.along, cells, nodes, s, arity)
+        rate_v = velocity_derivative(cells.across, cells, nodes, s, arity)
         law = cells.law[s]
         shear, by_u, by_v = shear_of(d_u, d_v)
         moment = -law[1] * (shear + law[3] * (by_u.dot(rate_u) + by_v.dot(rate_v)))
@@ -325,7 +298,7 @@ def compute_cell_forces(
 
 @kernel
 def sum_over_cells(
-    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
+    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, count: ti.i32, arity: ti.template(), share: Share
 ) -> Results:
     """Largest mean strain of nodes of triangles along warp and weft; elastic energy; after `measure_strains`."""
     if ti.static(not runs_on_gpu()):
@@ -336,8 +309,8 @@ def sum_over_cells(
         for k in range(share.items):
             s = lane * share.lane_step + k * share.item_step
             if s < count:
-                d_u = derivative(cells.along, cells, nodes, carry, s, arity)
-                d_v = derivative(cells.across, cells, nodes, carry, s, arity)
+                d_u = derivative(cells.along, cells, nodes, nodes.carry, s, arity)
+                d_v = derivative(cells.across, cells, nodes, nodes.carry, s, arity)
                 law = cells.law[s]
                 shear, _, _ = shear_of(d_u, d_v)
                 energy += 0.5 * law[1] * shear * shear

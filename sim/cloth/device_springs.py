@@ -17,8 +17,24 @@ MOST_COLOURS_AT_ONCE = 6
 """Colours that are loops of one kernel, at most, as many as bends of rectangles have: a launch costs 20 us of the host,
 and every loop its time to compile."""
 
-TINY_LENGTH = 1.0e-12
-"""Springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there."""
+TINY_LENGTH = 1.0e-12  # springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there
+
+LANES = 8
+"""Springs that a thread of a CPU solves side by side: numbers of a vector unit of 256 bits. Local blocks have as many
+columns."""
+
+
+@ti.func
+def column(block: ti.template(), at):
+    """Three numbers of a column."""
+    return ti.Vector([block[0, at], block[1, at], block[2, at]])
+
+
+@ti.func
+def set_column(block: ti.template(), at, vector):
+    """Give a column three numbers."""
+    for c in ti.static(range(3)):
+        block[c, at] = vector[c]
 
 
 class DeviceSprings:
@@ -33,10 +49,7 @@ class DeviceSprings:
         contracts: whether any of them feels the strain across.
         first_colours: first colour of each group of those that are solved in one launch, `first_colours.step` each;
             the last group may have empty ones.
-        piece_of_colour: first piece of each colour, and number of pieces, (colours + 1,); a piece is one spring where
-            springs are solved one by one.
         in_segments: whether these are threads.
-        segment_start: first spring of each piece, and number of springs, (pieces + 1,).
         host: the springs on the host.
         cloths: numbers of the cloths that they belong to.
     """
@@ -45,16 +58,17 @@ class DeviceSprings:
         self.host, self._cloth_of = springs, cloth_of
         self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = springs.arity, len(springs)
+        self.in_segments = springs.in_segments
+        starts = np.flatnonzero(np.diff(springs.segment, prepend=-1)) if self.in_segments else np.arange(self.count)
+        self.first_colours, piece_of_colour = colour_groups(springs.colour, starts, len(starts))
         self.on_device = SpringArrays(
             nodes=on_device(springs.nodes.ravel()),
             law=ti.Vector.ndarray(3, ti.f32, self.count),
             coefficients=on_device(springs.coefficients.ravel() if self.arity == 4 else np.zeros(1)),
             shift=ti.ndarray(ti.f32, self.count),
+            segment_start=on_device(np.append(starts, self.count)),
+            piece_of_colour=piece_of_colour,
         )
-        self.in_segments = springs.in_segments
-        starts = np.flatnonzero(np.diff(springs.segment, prepend=-1)) if self.in_segments else np.arange(self.count)
-        self.segment_start = on_device(np.append(starts, self.count))
-        self.first_colours, self.piece_of_colour = colour_groups(springs.colour, starts, len(starts))
         self.stiffness: NDArray[np.float64] = np.zeros(self.count)
         self.damping: NDArray[np.float64] = np.zeros(self.count)
         self.poisson: NDArray[np.float64] = np.zeros(self.count)

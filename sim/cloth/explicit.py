@@ -5,12 +5,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
-from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
+from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, compute_cell_forces
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
-from sim.cloth.parameters import ClothParameters
-from sim.cloth.stable_step import longest_explicit_step
+from sim.cloth.springs import longest_explicit_step
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.launch import kernel
@@ -28,27 +28,20 @@ class ExplicitSprings:
         counts = [family.count for family in springs] + [2 * family.count for family in cells]
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
         acting = [(family.host.nodes, family.host.coefficients) for family in springs]
-        for family in cells:  # two forces each, which act along d_u and d_v
-            host = family.host
-            acting.append(
-                (np.repeat(host.nodes, 2, axis=0), np.stack([host.along, host.across], axis=1).reshape(-1, host.arity))
-            )
-        nodes = np.concatenate([nodes.ravel() for nodes, _ in acting])
-        spring = np.concatenate(
-            [
-                np.repeat(first + np.arange(len(nodes)), nodes.shape[1])
-                for first, (nodes, _) in zip(self._first[:-1], acting, strict=True)
-            ]
-        )
-        coefficients = np.concatenate([coefficients.ravel() for _, coefficients in acting])
-        order = np.argsort(nodes, kind="stable")
-        start = np.searchsorted(nodes[order], np.arange(state.vertex_count + 1))
+        for host in (family.host for family in cells):  # two forces each, which act along d_u and d_v
+            both = np.stack([host.along, host.across], axis=1).reshape(-1, host.arity)
+            acting.append((np.repeat(host.nodes, 2, axis=0), both))
+        numbered = zip(self._first[:-1], acting, strict=True)
+        forces = [np.repeat(first + np.arange(len(nodes)), nodes.shape[1]) for first, (nodes, _) in numbered]
+        nodes, coefficients = (np.concatenate([each.ravel() for each in part]) for part in zip(*acting, strict=True))
+        shape = state.vertex_count, int(self._first[-1])
+        gathered = coo_array((coefficients, (nodes, np.concatenate(forces))), shape=shape).tocsr()
         self._start, self._spring, self._coefficient = (
-            on_device(each) for each in (start, spring[order], coefficients[order])
+            on_device(each) for each in (gathered.indptr, gathered.indices, gathered.data)
         )
         self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
 
-    def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
+    def take_parameters(self) -> None:
         """Springs hold their own stiffness."""
 
     def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:  # noqa: ARG002  (the integrators' protocol)
@@ -73,20 +66,11 @@ class ExplicitSprings:
         state = self._state
         for first, springs in zip(self._first, self._springs, strict=False):
             springs.contract(state.nodes, state.carry)
-            compute_spring_forces(
-                springs.on_device, state.nodes, state.motion, int(first), springs.count, springs.arity, self._force
-            )
+            compute_spring_forces(springs.on_device, state.nodes, int(first), springs.count, springs.arity, self._force)
         for first, cells in zip(self._first[len(self._springs) :], self._cells, strict=False):
-            cells.measure_strains(state.nodes, state.motion, is_damped=True)
+            cells.measure_strains(state.nodes, is_damped=True)
             compute_cell_forces(
-                cells.on_device,
-                cells.mesh,
-                state.nodes,
-                state.motion,
-                int(first),
-                cells.count,
-                cells.arity,
-                self._force,
+                cells.on_device, cells.mesh, state.nodes, int(first), cells.count, cells.arity, self._force
             )
         gather_spring_forces(
             self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
@@ -101,13 +85,7 @@ class ExplicitSprings:
 
 @kernel
 def compute_spring_forces(
-    springs: SpringArrays,
-    nodes: Nodes,
-    motion: NodeMotion,
-    first: ti.i32,
-    count: ti.i32,
-    arity: ti.template(),
-    force: Vectors,
+    springs: SpringArrays, nodes: Nodes, first: ti.i32, count: ti.i32, arity: ti.template(), force: Vectors
 ):
     """-k (C + tau dC/dt) d/|d| of each spring [N]."""
     for s in range(count):
@@ -115,8 +93,8 @@ def compute_spring_forces(
         rate = ti.math.vec3(0.0)
         for a in ti.static(range(arity)):
             c_a = coefficient(springs, s, arity, a)
-            d += c_a * motion.carry[springs.nodes[arity * s + a]]
-            rate += c_a * motion.velocity[springs.nodes[arity * s + a]]
+            d += c_a * nodes.carry[springs.nodes[arity * s + a]]
+            rate += c_a * nodes.velocity[springs.nodes[arity * s + a]]
         length = d.norm()
         value = ti.math.vec3(0.0)
         if length > TINY_LENGTH:

@@ -11,45 +11,36 @@ RUBBER_MODULUS, RUBBER_POISSON, RUBBER_DENSITY, RUBBER_THICKNESS = 1.5e6, 0.5, 1
 """Young's modulus [Pa], Poisson's ratio [-], density [kg/m³] and thickness [m] of a sheet of soft natural rubber (Gent
 2012, "Engineering with Rubber", ch. 3: 1-2 MPa, incompressible, 910-1200 kg/m³ with fillers)."""
 
-_PLANE = 1.0 - RUBBER_POISSON**2
+MATERIAL_UNITS: Mapping[str, str] = {
+    "mass_per_area": "kg/m²",
+    "stretch_stiffness": "N/m",
+    "shear_stiffness": "N/m",
+    "poisson_ratio": "-",
+    "bend_stiffness": "N m",
+    "thickness": "m",
+    "friction": "-",
+}
+"""Keys that a material gives."""
+
+_STIFFNESS = RUBBER_MODULUS * RUBBER_THICKNESS  # [N/m]
+
+_NUMBERS: Mapping[Material, tuple[float, ...]] = {
+    "cotton": (0.15, 4.0e3, 50.0, 0.0, 8.0e-6, 0.5e-3, 0.5),
+    "silk": (0.07, 3.0e3, 20.0, 0.0, 2.5e-6, 0.2e-3, 0.25),
+    "denim": (0.40, 10.0e3, 150.0, 0.0, 60.0e-6, 0.9e-3, 0.6),
+    "rubber": (
+        RUBBER_DENSITY * RUBBER_THICKNESS,
+        _STIFFNESS,
+        _STIFFNESS / (2.0 * (1.0 + RUBBER_POISSON)),
+        RUBBER_POISSON,
+        _STIFFNESS * RUBBER_THICKNESS**2 / (12.0 * (1.0 - RUBBER_POISSON**2)),
+        RUBBER_THICKNESS,
+        0.9,
+    ),
+}
 
 MATERIALS: Mapping[Material, Mapping[str, float]] = {
-    "cotton": {
-        "mass_per_area": 0.15,
-        "stretch_stiffness": 4.0e3,
-        "shear_stiffness": 50.0,
-        "poisson_ratio": 0.0,
-        "bend_stiffness": 8.0e-6,
-        "thickness": 0.5e-3,
-        "friction": 0.5,
-    },
-    "silk": {
-        "mass_per_area": 0.07,
-        "stretch_stiffness": 3.0e3,
-        "shear_stiffness": 20.0,
-        "poisson_ratio": 0.0,
-        "bend_stiffness": 2.5e-6,
-        "thickness": 0.2e-3,
-        "friction": 0.25,
-    },
-    "denim": {
-        "mass_per_area": 0.40,
-        "stretch_stiffness": 10.0e3,
-        "shear_stiffness": 150.0,
-        "poisson_ratio": 0.0,
-        "bend_stiffness": 60.0e-6,
-        "thickness": 0.9e-3,
-        "friction": 0.6,
-    },
-    "rubber": {
-        "mass_per_area": RUBBER_DENSITY * RUBBER_THICKNESS,
-        "stretch_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS,
-        "shear_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS / (2.0 * (1.0 + RUBBER_POISSON)),
-        "poisson_ratio": RUBBER_POISSON,
-        "bend_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS**3 / (12.0 * _PLANE),
-        "thickness": RUBBER_THICKNESS,
-        "friction": 0.9,
-    },
+    material: dict(zip(MATERIAL_UNITS, numbers, strict=True)) for material, numbers in _NUMBERS.items()
 }
 """Mass per area [kg/m²], stretch and shear stiffness [N/m], Poisson's ratio [-], bending rigidity [N m], thickness [m],
 friction [-].
@@ -74,14 +65,3 @@ SOURCES: Mapping[Material, str] = {
     "rubber": "1 mm of soft natural rubber of 1.5 MPa, incompressible, an isotropic elastic sheet (Gent 2012, ch. 3)",
 }
 """What each is, and where its numbers are from, for people."""
-
-MATERIAL_UNITS: Mapping[str, str] = {
-    "mass_per_area": "kg/m²",
-    "stretch_stiffness": "N/m",
-    "shear_stiffness": "N/m",
-    "poisson_ratio": "-",
-    "bend_stiffness": "N m",
-    "thickness": "m",
-    "friction": "-",
-}
-"""Keys that a material gives, in the order of `MATERIALS`."""

@@ -15,18 +15,14 @@ from sim.shapes.parameters import MeshShape
 Corner = Literal["x-y-", "x+y-", "x-y+", "x+y+"]
 Edge = Literal["x-", "x+", "y-", "y+"]
 
-DEFAULT_SUBSTEPS = 20
-"""Steps per frame of XPBD where none are asked for: 0.8 ms at 60 frames a second."""
-
-MOST_REFINED = 16
-"""Into so many parts those are divided at most."""
+DEFAULT_SUBSTEPS = 20  # steps per frame of XPBD where none are asked for: 0.8 ms at 60 frames a second
+MOST_REFINED = 16  # into so many parts those are divided at most
 
 MOST_SWEEPS, MOST_TURNS = 8, 4
 """Sweeps over the springs in a step, at most, where neither `iterations` nor `substeps` are asked for; and how often
 springs and contacts then take turns."""
 
-RUNAWAY_SPEED = 1.0e4
-"""No cloth of a film moves at thirty times the speed of sound [m/s]."""
+RUNAWAY_SPEED = 1.0e4  # no cloth of a film moves at thirty times the speed of sound [m/s]
 
 
 class RectangleSheet(Parameters):

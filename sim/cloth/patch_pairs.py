@@ -25,10 +25,10 @@ from sim.cloth.bundles import (
     TrackedNodes,
     Two,
 )
-from sim.cloth.contact_end import end_contacts
 from sim.cloth.near_pairs import NEVER, carry_pieces, keep_pairs
 from sim.cloth.patch_motion_kernels import (
     LARGEST_STILL,
+    end_contacts,
     look_at_patches,
     merge_boxes,
     pair_patches,

@@ -5,27 +5,21 @@ of their elements, laid out so that a processor compares one element with a bloc
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import EdgeBlocks, PatchElements, PatchNodes, TriangleBlocks
+from sim.cloth.bundles import EdgeBlocks, PatchBlocks, PatchElements, PatchNodes, TriangleBlocks
+from sim.cloth.state import HostCloths
 from sim.core.arrays import on_device
 from sim.core.reductions import runs_on_gpu
-
-if TYPE_CHECKING:
-    from sim.cloth.state import HostCloths
 
 BLOCK = 16
 """Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""
 
-FAR = 1.0e9
-"""Coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32."""
-
-NONE = -1
-"""In the place of a vertex: the block has no element there."""
+FAR = 1.0e9  # coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32
+NONE = -1  # in the place of a vertex: the block has no element there
 
 TRIANGLES_PER_PATCH, ON_GPU = 32, 24
 """Most triangles of a patch: few enough for all of them to move nearly as one, and enough for one pair of patches to
@@ -53,7 +47,7 @@ class Patches:
     """
 
     def __init__(self, host: HostCloths) -> None:
-        triangles, edges = host.triangles, host.edges
+        triangles, edges = host.triangles, host.edges.nodes
         patch = _patch_of_triangles(host)
         self.count = int(patch.max()) + 1 if len(patch) else 0
         self.vertex_count = len(host.position)
@@ -71,10 +65,8 @@ class Patches:
         self.first_vertex = on_device(_starts(np.sort(owner), self.count))
         self.vertices = on_device(np.argsort(owner, kind="stable"))
 
-        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
-        number = np.searchsorted(_key(edges, len(owner)), _key(sides, len(owner)))
         edge_owner = np.full(len(edges), self.count)
-        np.minimum.at(edge_owner, number, np.repeat(patch, 3))
+        np.minimum.at(edge_owner, host.edges.of_side, np.repeat(patch, 3))
         self.first_edge = on_device(_starts(np.sort(edge_owner), self.count))
         self.edges = on_device(edges[np.argsort(edge_owner, kind="stable")])
         self.cloth = on_device(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
@@ -111,31 +103,16 @@ def _starts(patch: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return starts
 
 
-def _key(pairs: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """A number for each pair of vertices, in the order of sorted pairs."""
-    key: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
-    return key
-
-
-class ElementBlocks:
+def blocks_of(patches: Patches) -> PatchBlocks:
     """Edges and triangles of each patch in whole blocks, which are filled up with elements that are far from all.
 
     One array for each component, and blocks of a length that the compiler knows: so it compares eight elements in an
-    instruction, where it took one after another from arrays of vectors.
-
-    Attributes:
-        edges: first block of each patch, (m + 1,); ends of the edges, (p,) ivec2, `NONE` in places that only fill up;
-            then x, y, z of their midpoints, and half their vectors [m], (p,) each.
-        triangles: first block of each patch, (m + 1,); corners, (q,) ivec3; then their boxes' lowest x, y, z, and
-            highest [m], (q,) each.
-
-    Args:
-        patches: of the cloths.
+    instruction, where it took one after another from arrays of vectors. `NONE` is in places that only fill up.
     """
-
-    def __init__(self, patches: Patches) -> None:
-        self.edges = EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
-        self.triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
+    triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
+    return PatchBlocks(
+        patches.vertex_lists, triangles, EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
+    )
 
 
 def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:

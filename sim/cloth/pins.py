@@ -17,8 +17,7 @@ from sim.core.parameters import Vector3
 
 Floats = NDArray[np.float64]
 
-ROUND_OFF_S = 1.0e-9
-"""Times that differ by less [s] are the same: sums of steps."""
+ROUND_OFF_S = 1.0e-9  # times that differ by less [s] are the same: sums of steps
 
 
 def holds(release_s: float, time_s: float) -> bool:

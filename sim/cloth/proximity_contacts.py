@@ -9,8 +9,7 @@ from sim.core.bundles import func, with_room
 VERTEX_TRIANGLE, EDGE_EDGE, WALL = -1, -2, -3
 """What a contact is between; from 0 on it is the number of the body that the cloth touches."""
 
-INACTIVE = -1.0e30
-"""Floor of a pair that is watched but pushes nothing."""
+INACTIVE = -1.0e30  # floor of a pair that is watched but pushes nothing
 
 GROWTH = 1.5
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from sim.cloth.bundles import (
     CollidingBodies,
-    Contacts,
     Four,
     PatchLists,
     PatchMotion,
-    Surface,
+    PushedBodies,
     Three,
+    Touching,
     Walls,
     Weights,
 )
@@ -23,24 +23,64 @@ from sim.cloth.near_pairs import lanes_of_pair
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
-from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision import Box
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
-from sim.core.bundles import func
-from sim.core.host_access import put
+from sim.core.bundles import func, with_room
+from sim.core.host_access import copied, put
 from sim.core.launch import kernel, large_kernel
 from sim.core.motion.paths import Poses
 from sim.core.reductions import LaneReduction, Share, reduced
 from sim.core.scheduling import begin_sharing, next_item, workers_for
 from sim.core.walls import Wall
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.device_shapes import GRID, SPHERE, TORUS, Shapes, distance_to
+from sim.shapes.device_shapes import CAPSULE, GRID, SPHERE, TORUS, DeviceShapes, Shapes, distance_to
 
 Array = NDArray[np.float64]
 
-PATCHES_AT_A_TIME = 4
-"""Patches that a thread takes at a time: those that touch a body take some microseconds each."""
+LOAD_UNIT = 1.0e-6  # unit of sums of the square roots of mobilities, in the largest of them
+
+_ROUND = (SPHERE, CAPSULE, TORUS)
+
+
+class CollisionBodies(DeviceShapes):
+    """All bodies that cloth may touch: those that move, then those that stand still.
+
+    Attributes:
+        colliding: the bodies for kernels that find contacts.
+        pushed: the bodies for kernels that push them.
+
+    Args:
+        geometries: of the bodies.
+        friction: Coulomb's coefficients [-], (b,).
+    """
+
+    def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float]) -> None:
+        super().__init__(geometries)
+        b = self.count
+        known = {name: getattr(self, name) for name in ("centre_of_mass", "radius", "step")}
+        motion = ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1))
+        self.colliding: CollidingBodies = with_room(
+            CollidingBodies, b, count=b, shapes=self.on_device, motion=motion, **known
+        )
+        twice = {name: ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1)) for name in ("motion_start", "motion_reached")}
+        six = {name: ti.ndarray(ti.i64, 6 * max(b, 1)) for name in ("gathered", "impulse")}
+        self.pushed: PushedBodies = with_room(
+            PushedBodies, b, may_move=0, count=b, motion=motion, load_unit=1.0, **twice, **six
+        )
+        self.set_friction(np.asarray(friction, dtype=np.float64))
+
+    def begin_frame(self) -> None:
+        """Note anew how deep cloth gets."""
+        self.colliding.depth.fill(0.0)
+
+    def set_friction(self, friction: Array) -> None:
+        """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""
+        if self.count:
+            put(self.colliding.friction, friction)
+
+
+PATCHES_AT_A_TIME = 4  # patches that a thread takes at a time: those that touch a body take some microseconds each
 
 LARGEST_ADVANCE = 0.25
 """How far cloth and a body that it may meet may move against each other in a step, in half shortest edges of that
@@ -57,14 +97,11 @@ LARGEST_LIFT = 0.25
 """How much farther from a round body than half their thickness vertices may be kept, in thicknesses, so that it does
 not show between them: triangles need not be looked at, which have four times the contacts."""
 
-SEARCH_LEVELS = 5
-"""How often the deepest point of a triangle is looked for around the last: to a 24th of its edges."""
-
-AT_CORNER = 0.98
-"""What has this barycentric coordinate is a vertex."""
+SEARCH_LEVELS = 5  # how often the deepest point of a triangle is looked for around the last: to a 24th of its edges
+AT_CORNER = 0.98  # what has this barycentric coordinate is a vertex
 
 WITH_EDGES = 2
-"""In `CollisionBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one
+"""In `CollidingBodies.shows`: edges are looked at, too. Where a straight edge of a body leads through a triangle, one
 point does not hold it: it turns about that."""
 
 NO_BODIES, BODIES, SHOWN_BODIES = range(3)
@@ -100,8 +137,8 @@ class RigidContact:
     """Finds where cloth touches bodies and walls.
 
     Cloth stays half its thickness away from both. Its vertices are looked at, which keep a little more where a round
-    body would show a little between them (`CollisionBodies.lift`); and where it may show more, as it is sharp, small or
-    thinly covered (`CollisionBodies.sag`), the deepest point of each triangle.
+    body would show a little between them (`CollidingBodies.lift`); and where it may show more, as it is sharp, small or
+    thinly covered, the deepest point of each triangle.
     The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
     by less than `LARGEST_ADVANCE` (`stable_dt`).
 
@@ -124,7 +161,7 @@ class RigidContact:
         self._spin_speed = np.zeros(len(geometries))
         self._shows = np.zeros(len(geometries), dtype=bool)
         self._longest, self._largest_half = 0.0, 0.0
-        self._taken = ti.ndarray(ti.i32, 2)
+        self._taken = ti.ndarray(ti.i32, 1)
         low, high = np.full((len(walls), 3), -np.inf), np.full((len(walls), 3), np.inf)
         joined = {side: np.zeros((len(walls), 3)) for side in (1.0, -1.0)}
         for number, wall in enumerate(walls):
@@ -143,14 +180,20 @@ class RigidContact:
 
     def set_thickness(self, least: float, largest: float) -> None:
         """Say how thick cloths are at least and at most [m]: where they can be bodies may show between vertices."""
-        missing = self.bodies.sag(self._longest) - 0.5 * (1.0 - OF_TRIANGLES) * least
+        b, shapes, colliding = self.bodies.count, self.bodies.on_device, self.bodies.colliding
+        size, kind = (copied(each)[:b] for each in (shapes.size, shapes.kind))
+        radius = np.where(kind == TORUS, size[:, 1], size[:, 0])
+        # How far it shows at most through triangles whose vertices touch it; what is sharp, or a grid, by any height.
+        sag = np.where(np.isin(kind, _ROUND), self._longest**2 / (6.0 * np.maximum(radius, 1.0e-30)), np.inf)
+        missing = sag - 0.5 * (1.0 - OF_TRIANGLES) * least
         shows = missing > LARGEST_LIFT * least
         lift = np.where(shows, 0.0, np.maximum(missing, 0.0))
-        self.bodies.set_lift(lift)
+        if b:
+            put(colliding.lift, lift)
         self._largest_half = 0.5 * largest + lift.max(initial=0.0)
         if (shows != self._shows).any():
             self._shows = shows
-            self.bodies.look_at_triangles(shows)
+            put(colliding.shows, np.where(kind == SPHERE, 1, 2) * shows)
 
     def place(self, poses: Poses, motion: BodyMotion | None = None) -> None:
         """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
@@ -163,7 +206,17 @@ class RigidContact:
             inverse_mass[:m], inverse_inertia[:m] = motion.inverse_mass, motion.inverse_inertia
             self._velocity[:m] = motion.velocity
             self._spin_speed[:m] = self._radius[:m] * np.linalg.norm(motion.angular_velocity, axis=1)
-        self.bodies.place(poses, inverse_mass, inverse_inertia)
+        if b:
+            colliding, pushed = self.bodies.colliding, self.bodies.pushed
+            put(colliding.position, poses.position[:b])
+            put(colliding.rotation, poses.rotation[:b])
+            put(pushed.inverse_mass, inverse_mass)
+            put(pushed.inverse_inertia, inverse_inertia)
+            mobility = inverse_mass + self._radius**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
+            self.bodies.pushed = pushed._replace(
+                may_move=int(pushed.may_move or inverse_mass.any()),
+                load_unit=LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0,
+            )
 
     def begin_substep(self, dt: float) -> None:
         """Foresee how the bodies move in a substep of dt [s] that cloth does not push."""
@@ -173,7 +226,8 @@ class RigidContact:
             shift, turn = np.zeros((b, 3)), np.zeros((b, 3))
             shift[:m] = dt * (motion.velocity + dt * motion.acceleration)
             turn[:m] = dt * motion.angular_velocity
-            self.bodies.set_motion(shift, turn)
+            if b:
+                put(self.bodies.colliding.motion, np.stack([shift, turn], axis=1).reshape(-1, 3))
 
     def stable_dt(self, state: ClothState, nodes: range, box: Box, *, at_most: float) -> float:
         """Largest step [s] for some nodes, of one cloth or of several.
@@ -236,12 +290,7 @@ class RigidContact:
             motion,
             margin,
             self._largest_half,
-            state.surface,
-            state.inverse_mass,
-            self._walls,
-            self.bodies.colliding,
-            recovery,
-            contacts.found,
+            Touching(state.surface, state.inverse_mass, self._walls, self.bodies.colliding, recovery, contacts.found),
             SHOWN_BODIES if self._shows.any() else BODIES if self.bodies.count else NO_BODIES,
         )
 
@@ -281,24 +330,23 @@ def fastest_approach(
 
 
 @func
-def touch_wall(
-    i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, recovery: ti.f32, allowed: ti.f32, contacts: Contacts
-):
+def touch_wall(i: ti.i32, w: ti.i32, allowed: ti.f32, near: Touching):
     """Append a vertex if it reaches a wall, or would if it were displaced by what is `allowed` besides [m].
 
     Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
     both.
     """
+    surface, walls = ti.static((near.surface, near.walls))
     x, half, n = surface.position[i], 0.5 * surface.thickness[i], walls.plane[w].xyz
     distance = n.dot(x) - walls.plane[w].w
-    least = least_displacement(distance, half, recovery)
+    least = least_displacement(distance, half, near.recovery)
     if distance < half or n.dot(surface.displacement[i]) < least + allowed:
         depth = ti.max(2.0 * WALL_DEPTH * half, walls.spacing, surface.displacement[i].norm())
         is_above = (x >= walls.low[w] - depth * walls.joined_low[w]).all()
         is_below = (x <= walls.high[w] + depth * walls.joined_high[w]).all()
         if is_above and is_below and distance > -depth:
             weights, nothing = ti.math.vec4(1.0, 0.0, 0.0, 0.0), ti.math.vec3(0.0)
-            append_contact(contacts, Four(i), weights, n, least, WALL, nothing, surface.friction[i])
+            append_contact(near.contacts, Four(i), weights, n, least, WALL, nothing, surface.friction[i])
 
 
 @func
@@ -325,41 +373,39 @@ def is_wall_near(m: ti.i32, w: ti.i32, patch: PatchMotion, largest_half: ti.f32,
 
 
 @func
-def allowed_between(
-    m: ti.i32, patch: PatchMotion, margin: Floats, largest_half: ti.f32, walls: Walls, bodies: CollidingBodies
-) -> ti.f32:
+def allowed_between(m: ti.i32, patch: PatchMotion, margin: Floats, largest_half: ti.f32, near: Touching) -> ti.f32:
     """How far contacts may displace a patch into what it does not touch yet [m]: where several bodies or walls are
     near, one may push it into another, which has to be among its contacts then.
     """
-    near = bodies_near(m, patch, largest_half + margin[m], bodies)
-    for w in range(walls.count):
-        near += ti.cast(is_wall_near(m, w, patch, largest_half + margin[m], walls), ti.i32)
-    return ti.select(near > 1, margin[m], 0.0)
+    count = bodies_near(m, patch, largest_half + margin[m], near.bodies)
+    for w in range(near.walls.count):
+        count += ti.cast(is_wall_near(m, w, patch, largest_half + margin[m], near.walls), ti.i32)
+    return ti.select(count > 1, margin[m], 0.0)
 
 
 @func
 def touch_body(
     b: ti.i32,
-    x: ti.math.vec3,
-    u: ti.math.vec3,
-    keeps: ti.f32,
-    own_friction: ti.f32,
-    corners: Four,
+    v: Four,
     weight: ti.math.vec4,
+    keeps: ti.f32,
     across: ti.math.mat3,
     half: ti.f32,
-    recovery: ti.f32,
     allowed: ti.f32,
-    bodies: CollidingBodies,
-    contacts: Contacts,
+    near: Touching,
 ):
-    """Append a body if a point of the cloth, at x with displacement u, comes nearer to it than it keeps, or would with
-    what is `allowed` besides [m].
+    """Append a body if a point of the cloth, the weighted mean of vertices, comes nearer to it than it keeps, or would
+    with what is `allowed` besides [m].
 
     Of its gradient there only what is `across` the element counts in which this point is the nearest to the body: on
     an edge of the body gradients are those of its faces, which would push the element along itself. How deep it is gets
     noted in thicknesses, if `half` of that is not 0.
     """
+    surface, bodies = ti.static((near.surface, near.bodies))
+    x, u = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    for k in ti.static(range(4)):
+        if weight[k] != 0.0:
+            x, u = x + weight[k] * surface.position[v[k]], u + weight[k] * surface.displacement[v[k]]
     r = x - bodies.position[b]
     relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
     comes = relative.norm() + allowed
@@ -378,10 +424,10 @@ def touch_body(
                 gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
             n = turned @ unit_or(gradient, y)
             n = unit_or(across @ n, n)
-            least = least_displacement(distance, keeps, recovery)
+            least = least_displacement(distance, keeps, near.recovery)
             if distance < keeps or n.dot(relative) < least + allowed:
-                friction = ti.sqrt(own_friction * bodies.friction[b])
-                append_contact(contacts, corners, weight, n, least, b, r, friction)
+                friction = ti.sqrt(surface.friction[v[0]] * bodies.friction[b])
+                append_contact(near.contacts, v, weight, n, least, b, r, friction)
 
 
 @func
@@ -419,12 +465,7 @@ def find_rigid_contacts(
     motion: PatchMotion,
     margin: Floats,
     largest_half: ti.f32,
-    surface: Surface,
-    inverse_mass: Floats,
-    walls: Walls,
-    bodies: CollidingBodies,
-    recovery: ti.f32,
-    contacts: Contacts,
+    near: Touching,
     meets: ti.template(),
 ) -> ti.math.ivec3:
     """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if cloth `meets` bodies,
@@ -434,68 +475,48 @@ def find_rigid_contacts(
     share a patch, and workers (`sim.core.scheduling`). Returns the numbers of the list's counter, whose first is 0
     then.
     """
-    vertices, elements = ti.static((patches.vertices, patches.elements))
+    vertices, elements, surface, contacts = ti.static((patches.vertices, patches.elements, near.surface, near.contacts))
+    walls, bodies = ti.static((near.walls, near.bodies))
     lanes, workers_end = work[0], work[1]
     begin_sharing(taken, 0)
     for worker in range(workers_end):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < vertices.count * lanes:
             m = item // lanes
-            allowed = allowed_between(m, motion, margin, largest_half, walls, bodies)
+            allowed = allowed_between(m, motion, margin, largest_half, near)
             for w in range(walls.count):
-                is_near = is_wall_near(m, w, motion, largest_half + allowed, walls)
-                place = ti.select(is_near, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                comes = is_wall_near(m, w, motion, largest_half + allowed, walls)
+                place = ti.select(comes, vertices.first[m], vertices.first[m + 1]) + item % lanes
                 while place < vertices.first[m + 1]:
-                    touch_wall(vertices.nodes[place], w, surface, walls, recovery, allowed, contacts)
+                    touch_wall(vertices.nodes[place], w, allowed, near)
                     place += lanes
             if ti.static(meets != NO_BODIES):
-                near = bodies_near(m, motion, largest_half + allowed, bodies)
-                place = ti.select(near > 0, vertices.first[m], vertices.first[m + 1]) + item % lanes
+                is_near = bodies_near(m, motion, largest_half + allowed, bodies) > 0
+                place = ti.select(is_near, vertices.first[m], vertices.first[m + 1]) + item % lanes
                 while place < vertices.first[m + 1]:
                     i = vertices.nodes[place]
-                    half = 0.5 * surface.thickness[i]
+                    half, weight = 0.5 * surface.thickness[i], ti.math.vec4(1.0, 0.0, 0.0, 0.0)
+                    noted, across = ti.select(near.inverse_mass[i] > 0.0, half, 0.0), ti.Matrix.identity(ti.f32, 3)
                     for b in range(bodies.count):
-                        touch_body(
-                            b,
-                            surface.position[i],
-                            surface.displacement[i],
-                            half + bodies.lift[b],
-                            surface.friction[i],
-                            Four(i),
-                            ti.math.vec4(1.0, 0.0, 0.0, 0.0),
-                            ti.Matrix.identity(ti.f32, 3),
-                            ti.select(inverse_mass[i] > 0.0, half, 0.0),
-                            recovery,
-                            allowed,
-                            bodies,
-                            contacts,
-                        )
+                        touch_body(b, Four(i), weight, half + bodies.lift[b], across, noted, allowed, near)
                     place += lanes
+                if ti.static(meets == SHOWN_BODIES):
+                    # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
+                    edges = elements.first_edge[m + 1] - elements.first_edge[m]
+                    end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
+                    place = ti.select(is_near, item % lanes, end)
+                    while place < end:
+                        corners = Three(0)
+                        if place < edges:
+                            ends = elements.edges[elements.first_edge[m] + place]
+                            corners = Three(ends[0], ends[1], ends[1])
+                        else:
+                            corners = elements.triangles[elements.first_triangle[m] + place - edges]
+                        for b in range(bodies.count):
+                            if bodies.shows[b] > ti.cast(place < edges, ti.i32):
+                                touch_triangle(b, corners, allowed, near)
+                        place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
-    if ti.static(meets == SHOWN_BODIES):
-        begin_sharing(taken, 1)
-        for worker in range(workers_end):
-            item = next_item(-1, worker, taken, 1, PATCHES_AT_A_TIME)
-            while item < elements.count * lanes:
-                m = item // lanes
-                allowed = allowed_between(m, motion, margin, largest_half, walls, bodies)
-                near = bodies_near(m, motion, largest_half + allowed, bodies)
-                # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
-                edges = elements.first_edge[m + 1] - elements.first_edge[m]
-                end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
-                place = ti.select(near > 0, item % lanes, end)
-                while place < end:
-                    corners = Three(0)
-                    if place < edges:
-                        ends = elements.edges[elements.first_edge[m] + place]
-                        corners = Three(ends[0], ends[1], ends[1])
-                    else:
-                        corners = elements.triangles[elements.first_triangle[m] + place - edges]
-                    for b in range(bodies.count):
-                        if bodies.shows[b] > ti.cast(place < edges, ti.i32):
-                            touch_triangle(b, corners, surface, inverse_mass, recovery, allowed, bodies, contacts)
-                    place += lanes
-                item = next_item(item, worker, taken, 1, PATCHES_AT_A_TIME)
     found = ti.math.ivec3(contacts.counter[0], contacts.counter[1], contacts.counter[2])
     contacts.counter[3] = ti.select(contacts.counter[4] == 1 and found[0] <= contacts.capacity, found[0], 0)
     contacts.counter[0] = 0
@@ -503,16 +524,7 @@ def find_rigid_contacts(
 
 
 @func
-def touch_triangle(
-    b: ti.i32,
-    corners: Three,
-    surface: Surface,
-    inverse_mass: Floats,
-    recovery: ti.f32,
-    allowed: ti.f32,
-    bodies: CollidingBodies,
-    contacts: Contacts,
-):
+def touch_triangle(b: ti.i32, corners: Three, allowed: ti.f32, near: Touching):
     """Append a body if it comes too near to a triangle between its corners, or to an edge: a, b, b; `allowed` is as of
     `touch_body`.
 
@@ -520,9 +532,10 @@ def touch_triangle(
     in the body is where the job wants it. The distance to a convex body is a convex function: it sags nowhere below
     that between the corners by more than three times what it does in their middle.
     """
+    surface, bodies = ti.static((near.surface, near.bodies))
     v, third = corners, 1.0 / 3.0
     half = 0.5 * surface.thickness[v[0]]
-    y, u, x = Corners(0.0), Corners(0.0), Corners(0.0)
+    y, x = Corners(0.0), Corners(0.0)
     comes, nearest = 0.0, 1.0e30
     for k in ti.static(range(3)):
         r = surface.position[v[k]] - bodies.position[b]
@@ -530,8 +543,7 @@ def touch_triangle(
         comes, nearest = ti.max(comes, relative.norm() + allowed), ti.min(nearest, r.norm())
         at = bodies.rotation[b].transpose() @ r + bodies.centre_of_mass[b]
         for axis in ti.static(range(3)):
-            x[k, axis], u[k, axis] = surface.position[v[k]][axis], surface.displacement[v[k]][axis]
-            y[k, axis] = at[axis]
+            x[k, axis], y[k, axis] = surface.position[v[k]][axis], at[axis]
     size = ti.max((y[1, :] - y[0, :]).norm(), (y[2, :] - y[0, :]).norm())
     if nearest < bodies.radius[b] + half + size + comes:
         in_middle = distance_to(y.transpose() @ ti.math.vec3(third), b, bodies.shapes)
@@ -544,7 +556,7 @@ def touch_triangle(
                 distance = distance_to(y.transpose() @ share, b, bodies.shapes)
                 sag += third * distance
                 held = ti.select(k == 0, v[0], ti.select(k == 1, v[1], v[2]))
-                if inverse_mass[held] == 0.0 and distance < 0.0:
+                if near.inverse_mass[held] == 0.0 and distance < 0.0:
                     is_held = True
             is_convex = not is_grid and bodies.shapes.kind[b] != TORUS
             if not is_held and not (is_convex and 3.0 * sag < (1.0 - OF_TRIANGLES) * half):
@@ -560,18 +572,6 @@ def touch_triangle(
                     if share.min() < 1.0 - AT_CORNER:
                         share[0] = 1.0
                 if share.max() < AT_CORNER:
-                    touch_body(
-                        b,
-                        x.transpose() @ share,
-                        u.transpose() @ share,
-                        OF_TRIANGLES * half,
-                        surface.friction[v[0]],
-                        Four(v[0], v[1], v[2], v[0]),
-                        ti.math.vec4(share[0], share[1], share[2], 0.0),
-                        across,
-                        half,
-                        recovery,
-                        allowed,
-                        bodies,
-                        contacts,
-                    )
+                    weight = ti.math.vec4(share[0], share[1], share[2], 0.0)
+                    three = Four(v[0], v[1], v[2], v[0])
+                    touch_body(b, three, weight, OF_TRIANGLES * half, across, half, allowed, near)

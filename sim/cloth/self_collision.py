@@ -9,10 +9,10 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, PatchBlocks, Rest
+from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, Rest
 from sim.cloth.near_pairs import find_near_pairs, range_of_vectors
 from sim.cloth.patch_pairs import PairList, PatchPairs
-from sim.cloth.patches import ElementBlocks, Patches
+from sim.cloth.patches import Patches, blocks_of
 from sim.cloth.proximity_contacts import ContactList
 from sim.core.arrays import on_device
 from sim.core.host_access import copied
@@ -62,18 +62,17 @@ class SelfCollision:
         self.patches = Patches(state.host)
         self.patch_pairs = PatchPairs(self.patches)
         self._rest = Rest(state.body, on_device(state.host.position))
-        blocks = ElementBlocks(self.patches)
-        self._blocks = PatchBlocks(self.patches.vertex_lists, blocks.triangles, blocks.edges)
+        self._blocks = blocks_of(self.patches)
         self._collides = ti.ndarray(ti.i32, len(state.names))
         self._ends, self._taken = ti.ndarray(ti.i32, 4), ti.ndarray(ti.i32, 4)
         self.with_triangles, self.of_edges = (
             PairList(capacity=capacity, pieces=self.patch_pairs.capacity, ends=self._ends, number=number)
-            for number, capacity in enumerate((state.vertex_count, state.edge_count))
+            for number, capacity in enumerate((state.vertex_count, len(state.host.edges.nodes)))
         )
-        edges = state.host.position[state.host.edges]
+        edges = state.host.position[state.host.edges.nodes]
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
         self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
-        cloth_of = state.host.body[state.host.edges[:, 0]]
+        cloth_of = state.host.body[state.host.edges.nodes[:, 0]]
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
         self._nothing = on_device(np.zeros(3, dtype=np.int32))
         self.outcome = self._nothing

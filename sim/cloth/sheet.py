@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +17,9 @@ from sim.shapes.solid import ShapeError
 
 Vectors = NDArray[np.float64]
 Indices = NDArray[np.int32]
+Where = Callable[[NDArray[np.integer]], str]
 
-SMALLEST_LENGTH, LARGEST_LENGTH = 1.0e-6, 1.0e6
-"""Of what a sheet measures [m]; single precision ends well within."""
+SMALLEST_LENGTH, LARGEST_LENGTH = 1.0e-6, 1.0e6  # of what a sheet measures [m]; single precision ends well within
 
 FLAT_TRIANGLE = 1.0e-4
 """A triangle less high than this share of its longest edge is a line: its angles are round-off in a file's float32."""
@@ -78,7 +79,9 @@ def build_sheet(shape: RectangleSheet | MeshShape) -> RestSheet:
     Raises:
         ShapeError: a mesh file is missing or unreadable, or its mesh is no sheet.
     """
-    return rectangle(shape) if isinstance(shape, RectangleSheet) else _sheet_of_file(shape)
+    if isinstance(shape, RectangleSheet):
+        return rectangle(shape)
+    return sheet_of_triangles(*read_upright_triangles(shape), label=Path(shape.file).name)
 
 
 def rectangle(shape: RectangleSheet) -> RestSheet:
@@ -142,7 +145,10 @@ def sheet_of_triangles(vertices: Vectors, triangles: NDArray[np.integer], *, lab
         warnings.append(f'"{label}": merged {len(vertices) - len(merged)} split or unused vertices')
     if len(faces) < len(triangles):
         warnings.append(f'"{label}": dropped {len(triangles) - len(faces)} collapsed or repeated triangles')
-    where = _Places(corners, used, merged)
+
+    def where(nodes: NDArray[np.integer]) -> str:
+        return _place(corners, used, merged[nodes])
+
     _refuse_flat_triangles(merged, faces, where, label)
     _refuse_branching_edges(faces, where, label)
     oriented, _ = igl.bfs_orient(faces)
@@ -203,11 +209,6 @@ def _drop_second_sides(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     return triangles[np.sort(first)]
 
 
-def _sheet_of_file(shape: MeshShape) -> RestSheet:
-    vertices, triangles = read_upright_triangles(shape)
-    return sheet_of_triangles(vertices, triangles, label=Path(shape.file).name)
-
-
 def _nodes_of(vertices: Vectors, nodes: Vectors) -> Indices:
     """Which node each vertex has become; -1 for those that were dropped."""
     from scipy.spatial import cKDTree
@@ -220,6 +221,18 @@ def _nodes_of(vertices: Vectors, nodes: Vectors) -> Indices:
     return numbers
 
 
+def pieces_of(triangles: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Number of the connected piece that each node belongs to, up to the last that a triangle has, (n,)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = int(triangles.max(initial=-1)) + 1
+    a, b, c = triangles.T
+    links = coo_array((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
+    label: NDArray[np.int32] = connected_components(links, directed=False)[1] if count else np.zeros(0, dtype=np.int32)
+    return label
+
+
 def triangle_areas(vertices: Vectors, triangles: NDArray[np.integer]) -> NDArray[np.float64]:
     """Area of each triangle [m²], (k,)."""
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)
@@ -227,43 +240,28 @@ def triangle_areas(vertices: Vectors, triangles: NDArray[np.integer]) -> NDArray
     return areas
 
 
-@dataclass(frozen=True, eq=False)
-class _Places:
-    """How errors say where in a mesh something is.
+def _place(corners: Vectors, numbers: NDArray[np.int64], nodes: Vectors) -> str:
+    """The middle of some nodes [m], and the vertices of the file that they were, by their corners and numbers there."""
+    from scipy.spatial import cKDTree
 
-    Attributes:
-        corners: vertices that triangles use [m], (c, 3).
-        numbers: theirs in the file, (c,).
-        nodes: [m], (n, 3).
-    """
-
-    corners: Vectors
-    numbers: NDArray[np.int64]
-    nodes: Vectors
-
-    def of(self, nodes: NDArray[np.integer]) -> str:
-        """The middle of some nodes, and the vertices of the file that they were."""
-        from scipy.spatial import cKDTree
-
-        points = self.nodes[nodes]
-        _, nearest = cKDTree(self.corners).query(points)
-        middle = ", ".join(f"{coordinate:.4g}" for coordinate in points.mean(axis=0))
-        *others, last = (str(number) for number in sorted(self.numbers[nearest]))
-        return f"({middle}) m between vertices {', '.join(others)} and {last}, counted from 0"
+    _, nearest = cKDTree(corners).query(nodes)
+    middle = ", ".join(f"{coordinate:.4g}" for coordinate in nodes.mean(axis=0))
+    *others, last = (str(number) for number in sorted(numbers[nearest]))
+    return f"({middle}) m between vertices {', '.join(others)} and {last}, counted from 0"
 
 
-def _refuse_flat_triangles(vertices: Vectors, triangles: NDArray[np.int64], where: _Places, label: str) -> None:
+def _refuse_flat_triangles(vertices: Vectors, triangles: NDArray[np.int64], where: Where, label: str) -> None:
     corners = vertices[triangles]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     flat = np.flatnonzero(2.0 * triangle_areas(vertices, triangles) <= FLAT_TRIANGLE * longest**2)
     if len(flat):
         raise ShapeError(
             f'shape.file: {len(flat)} triangles of "{label}" have no area, the first at '
-            f"{where.of(triangles[flat[0]])}; remove them (Blender: Mesh > Clean Up > Degenerate Dissolve)"
+            f"{where(triangles[flat[0]])}; remove them (Blender: Mesh > Clean Up > Degenerate Dissolve)"
         )
 
 
-def _refuse_branching_edges(triangles: NDArray[np.int64], where: _Places, label: str) -> None:
+def _refuse_branching_edges(triangles: NDArray[np.int64], where: Where, label: str) -> None:
     edges, count = np.unique(
         np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
     )
@@ -271,16 +269,16 @@ def _refuse_branching_edges(triangles: NDArray[np.int64], where: _Places, label:
     if len(branching):
         raise ShapeError(
             f'shape.file: {len(branching)} edges of "{label}" have three triangles or more, the first at '
-            f"{where.of(branching[0])}; a cloth has two sides: split it there"
+            f"{where(branching[0])}; a cloth has two sides: split it there"
         )
 
 
-def _refuse_one_sided(triangles: NDArray[np.integer], where: _Places, label: str) -> None:
+def _refuse_one_sided(triangles: NDArray[np.integer], where: Where, label: str) -> None:
     """After neighbours were made to agree: one edge passed twice the same way makes a Moebius strip."""
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     passed, count = np.unique(edges, axis=0, return_counts=True)
     twice = passed[count > 1]
     if len(twice):
         raise ShapeError(
-            f'shape.file: "{label}" has one side only, like a Moebius strip, seen at {where.of(twice[0])}; cut it open'
+            f'shape.file: "{label}" has one side only, like a Moebius strip, seen at {where(twice[0])}; cut it open'
         )

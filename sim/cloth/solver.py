@@ -23,10 +23,8 @@ from sim.cloth.parameters import (
     shared_conflicts,
 )
 from sim.cloth.pins import Pins
-from sim.cloth.rectangles import rectangles_in_rows
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import joined, springs_of
-from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
+from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths, NodeLoad, finish_step
 from sim.cloth.totals import ClothTotals
@@ -46,25 +44,10 @@ REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.03, 0
 which springs and contacts take another turn; below which sweeps go back, and below which steps do: turns end between
 both. It falls with every turn and sweep, and with the square of the step."""
 
-LIVE_KEYS = frozenset(
-    (
-        "mass_per_area",
-        "stretch_stiffness",
-        "shear_stiffness",
-        "poisson_ratio",
-        "bend_stiffness",
-        "damping",
-        "bend_damping",
-        "thickness",
-        "friction",
-        "self_collision",
-        "wind",
-        "air_density",
-        "drag",
-        "skin_drag",
-    )
+FIXED_KEYS = frozenset(
+    ("name", "shape", "position", "rotation_deg", "velocity", "material", "pin", "integrator", "substeps", "iterations")
 )
-"""What may change between frames."""
+"""What cannot change between frames; all else can."""
 
 
 class ClothSolver:
@@ -120,12 +103,8 @@ class ClothSolver:
         self.contacts: ContinuousContacts | None = None
         self.load: NodeLoad | None = None
         shared = self.parameters[0]
-        in_rows = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
         first_nodes = host.first_node.tolist()
-        groups = [
-            (number in in_rows, cloth.iterations or 0, cloth.substeps is None)
-            for number, cloth in enumerate(self.parameters)
-        ]
+        groups = [(cloth.iterations or 0, cloth.substeps is None) for cloth in self.parameters]
         springs, cells = (
             joined([elements_of(sheet) for sheet in sheets], first_nodes, groups=groups)
             for elements_of in (springs_of, lambda sheet: [cells_of(sheet)])
@@ -151,7 +130,7 @@ class ClothSolver:
         Raises:
             ValueError: a key that cannot change, or a value that it cannot have; nothing has changed then.
         """
-        if fixed := set(changes) - LIVE_KEYS:
+        if fixed := set(changes) - (ClothParameters.model_fields.keys() - FIXED_KEYS):
             raise ValueError(f"{min(fixed)} of a cloth cannot change while it is simulated; build it anew")
         number = self.state.names.index(name)
         changed = ClothParameters.model_validate({**self.parameters[number].model_dump(exclude_unset=True), **changes})
@@ -282,7 +261,7 @@ class ClothSolver:
             nonlocal at_end
             if excess is None:
                 at_end = integrator.excess(dt)
-            finish_step(state.nodes, state.motion, state.position, state.limit, dt, reasons)
+            finish_step(state.nodes, state.position, state.limit, dt, reasons)
 
         if self.contacts is None or not self.contacts.resolve(state, dt, relax, conclude):
             conclude(self._no_reasons)
@@ -322,7 +301,7 @@ class ClothSolver:
         self.state.set_material(cloths)
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
-        self._integrator.take_parameters(cloths)
+        self._integrator.take_parameters()
         self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
         self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
         self._refines = np.array([cloth.substeps is None for cloth in cloths])

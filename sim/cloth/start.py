@@ -27,8 +27,7 @@ TOUCHING = 1.0e-6
 LATTICE_BITS = 30
 """Positions are whole multiples of a quantum, up to 2^30 of them within reach; twice that is all an int32 holds."""
 
-LOST_DISTANCE = 10.0
-"""Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
+LOST_DISTANCE = 10.0  # cloth stops this far out, in diagonals of the domain: it fell out of sight
 
 COARSEST = 0.25
 """Most that positions may be rounded to, in thicknesses: contacts do not know which layer is above beyond that."""

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import NodeMotion, Nodes, Surface
+from sim.cloth.bundles import Nodes, Surface
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.sheet import Grid, RestSheet
-from sim.cloth.springs import edges_of
+from sim.cloth.sheet import RestSheet, pieces_of
+from sim.cloth.springs import Edges, edges_of
 from sim.cloth.start import quantum_of, start_positions
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import with_room
@@ -35,10 +33,9 @@ class HostCloths:
         node_area: share of the area of each node [m²], (n,).
         uv: coordinates on the sheet at rest [m], (n, 2).
         triangles: (k, 3) int32.
-        edges: of the triangles, each once, the smaller number first, sorted, (e, 2) int32.
+        edges: of the triangles (`springs.Edges`).
         body: cloth of each node, (n,) int32.
         is_connected: of each cloth, whether it is one piece.
-        grids: of each cloth, how it is divided if it is a rectangle.
     """
 
     names: tuple[str, ...]
@@ -49,10 +46,9 @@ class HostCloths:
     node_area: NDArray[np.float64]
     uv: NDArray[np.float64]
     triangles: NDArray[np.int32]
-    edges: NDArray[np.int32]
+    edges: Edges
     body: NDArray[np.int32]
     is_connected: tuple[bool, ...]
-    grids: tuple[Grid | None, ...]
 
     @classmethod
     def of(cls, cloths: Sequence[ClothParameters], sheets: Sequence[RestSheet]) -> "HostCloths":
@@ -73,10 +69,9 @@ class HostCloths:
             node_area=np.concatenate([sheet.node_area for sheet in sheets]),
             uv=np.concatenate([sheet.uv for sheet in sheets]),
             triangles=triangles,
-            edges=edges_of(triangles).nodes,
+            edges=edges_of(triangles),
             body=np.repeat(np.arange(len(cloths), dtype=np.int32), counts),
-            is_connected=tuple(_is_connected(sheet) for sheet in sheets),
-            grids=tuple(sheet.grid for sheet in sheets),
+            is_connected=tuple(not pieces_of(sheet.triangles).any() for sheet in sheets),
         )
 
     def of_nodes(self, values: Sequence[float]) -> NDArray[np.float64]:
@@ -86,14 +81,6 @@ class HostCloths:
     def of_triangles(self, values: Sequence[float]) -> NDArray[np.float64]:
         """A number of each cloth for each of its triangles, (k,)."""
         return np.repeat(np.asarray(values, dtype=np.float64), np.diff(self.first_triangle))
-
-
-def _is_connected(sheet: RestSheet) -> bool:
-    """Whether every node of a sheet can be reached from every other one along triangles."""
-    count = len(sheet.vertices)
-    a, b, c = sheet.triangles.T
-    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
-    return bool(connected_components(links, directed=False, return_labels=False) == 1)
 
 
 class ClothState:
@@ -106,20 +93,11 @@ class ClothState:
 
     Attributes:
         host: what they started with, on the host.
-        lattice: at the start of the substep, in quanta, (n,) ivec3.
-        position: the same rounded to float32 [m], (n,) vec3.
-        carry: what the lattice lacks [m], (n,) vec3, at most half a quantum.
-        displacement: from the lattice's position to the end of the substep, `carry` included [m], (n,) vec3.
-        velocity: [m/s], (n,) vec3.
+        nodes, surface: arrays for kernels; each also an attribute of its own.
         elastic: by how much triangles of meshes displaced nodes in the last step [m], (n,) vec3; 0 elsewhere.
         mass: of a node [kg], (n,), pinned or not.
-        inverse_mass: [1/kg], (n,); 0 where a node is pinned.
-        thickness: distance that layers keep [m], (n,).
-        friction: Coulomb's coefficient [-], (n,).
         body: cloth of a node, (n,) int32.
         triangles: (k,) ivec3.
-        edges: (e,) ivec2.
-        nodes, motion, surface: some of these arrays for kernels.
         names: of the cloths.
         self_collision: of each cloth: whether it collides with itself.
         is_free: of each cloth: whether it is one piece, and no pin holds any of its nodes.
@@ -139,14 +117,16 @@ class ClothState:
         self.quantum = quantum_of(reach)
         self.limit = int(reach / self.quantum)
         self.nodes: Nodes = with_room(Nodes, n, quantum=self.quantum)
-        self.motion: NodeMotion = with_room(NodeMotion, n)
         self.surface: Surface = with_room(Surface, n, displacement=self.nodes.displacement)
-        self.lattice, _, self.inverse_mass, self.displacement = self.nodes
-        self.carry, self.velocity = self.motion
+        self.lattice, _, self.inverse_mass, self.displacement, self.carry, self.velocity = self.nodes
         self.position, _, self.thickness, self.friction = self.surface
         self.elastic = ti.Vector.ndarray(3, ti.f32, n)
         self.mass = ti.ndarray(ti.f32, n)
-        self.body, self.triangles, self.edges = on_device(host.body), on_device(host.triangles), on_device(host.edges)
+        self.body, self.triangles, self.edges = (
+            on_device(host.body),
+            on_device(host.triangles),
+            on_device(host.edges.nodes),
+        )
         self.self_collision: tuple[bool, ...] = ()
         self.is_free: tuple[bool, ...] = ()
         self.set_positions(host.position)
@@ -167,11 +147,6 @@ class ClothState:
         """Number of triangles."""
         return len(self.host.triangles)
 
-    @property
-    def edge_count(self) -> int:
-        """Number of edges."""
-        return len(self.host.edges)
-
     def set_positions(self, positions: NDArray[np.floating]) -> None:
         """Put all nodes at world positions [m], (n, 3)."""
         exact = np.asarray(positions, dtype=np.float64)
@@ -187,7 +162,7 @@ class ClothState:
 
     def place_displaced(self) -> None:
         """Follow the lattice with what is derived from it: float32 positions, and displacements of nothing yet."""
-        round_positions(self.nodes, self.carry, self.position)
+        round_positions(self.nodes, self.position)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take mass, thickness, friction and whether they collide with themselves from the cloths' parameters."""
@@ -208,15 +183,14 @@ class ClothState:
 
 
 @kernel
-def round_positions(nodes: Nodes, carry: Vectors, position: Vectors):
+def round_positions(nodes: Nodes, position: Vectors):
     """float32 positions from the lattice; displacements that hold what it lacks."""
     for i in range(nodes.lattice.shape[0]):
         position[i] = ti.cast(nodes.lattice[i], ti.f32) * nodes.quantum
-        nodes.displacement[i] = carry[i]
+        nodes.displacement[i] = nodes.carry[i]
 
 
-LARGEST_MOVE = 2.0**29
-"""Most quanta in a step: a quarter of the lattice, so that integers do not overflow."""
+LARGEST_MOVE = 2.0**29  # most quanta in a step: a quarter of the lattice, so that integers do not overflow
 
 
 @kernel
@@ -237,14 +211,7 @@ def move_pinned(
 
 
 @kernel
-def finish_step(
-    nodes: Nodes,
-    motion: NodeMotion,
-    position: Vectors,
-    limit: ti.i32,
-    dt: ti.f32,
-    reasons: Integers,
-):
+def finish_step(nodes: Nodes, position: Vectors, limit: ti.i32, dt: ti.f32, reasons: Integers):
     """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
 
     A velocity changes by what the displacement differs from dt times itself: the same as the displacement over dt, but
@@ -256,7 +223,7 @@ def finish_step(
     end = ti.select(reasons[0] + reasons[1] + reasons[2] == 0, position.shape[0], 0)
     for i in range(end):
         u_i = nodes.displacement[i]
-        v_i = motion.velocity[i] + (u_i - (motion.carry[i] + dt * motion.velocity[i])) / dt
+        v_i = nodes.velocity[i] + (u_i - (nodes.carry[i] + dt * nodes.velocity[i])) / dt
         for axis in ti.static(range(3)):
             if is_finite(u_i[axis]):
                 quanta = ti.round(u_i[axis] / nodes.quantum)
@@ -269,9 +236,9 @@ def finish_step(
                     v_i[axis] = 0.0
                 nodes.lattice[i][axis] = place
                 position[i][axis] = ti.cast(place, ti.f32) * nodes.quantum
-                motion.carry[i][axis] = rest
-        motion.velocity[i] = v_i
-        nodes.displacement[i] = motion.carry[i]
+                nodes.carry[i][axis] = rest
+        nodes.velocity[i] = v_i
+        nodes.displacement[i] = nodes.carry[i]
 
 
 class NodeLoad:

@@ -1,32 +1,30 @@
-"""Threads of rectangles on a GPU, solved piece by piece instead of spring by spring."""
+"""Threads of rectangles, solved piece by piece instead of spring by spring."""
 
 from collections.abc import Callable
 
 import numpy as np
 import taichi as ti
 
-from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, colour_bounds
+from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
+from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers
-from sim.core.bundles import func
-from sim.core.launch import kernel
+from sim.core.bundles import func, with_room
+from sim.core.launch import kernel, large_kernel
+from sim.core.reductions import runs_on_gpu
+from sim.core.scheduling import LEAST_RUN
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
 across threads need dt² 4 T w / |d| <= 4, summed over the two threads of a node."""
 
-LEAST_BLOCK = 32
-"""Threads of a block of a GPU, at least: those that it runs as one."""
+LEAST_BLOCK = 32  # threads of a block of a GPU, at least: those that it runs as one
 
 STRAIGHTENED = 0.35
 """Part of what is more that turns with the springs: waves are stable from 1/4 on, and neither damped nor driven."""
 
-LEAST_WEIGHT = 1.0e-20
-"""Inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions."""
-
-LEAST_ALIKE = 0.995
-"""Cosine of the angle that a spring may turn by in a step for its direction to be that of the start."""
+LEAST_WEIGHT = 1.0e-20  # inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions
+LEAST_ALIKE = 0.995  # cosine of the angle that a spring may turn by in a step for its direction to be that of the start
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -49,16 +47,17 @@ class ThreadSolver:
     its corner would jitter there. `straighten` therefore lets a part of what is more turn with its springs, as in
     Newmark's implicit scheme.
 
-    For GPUs: a block of their threads solves a piece by parallel cyclic reduction (Hockney 1965; Zhang, Cohen & Owens
-    2010, "Fast tridiagonal solvers on the GPU"), a row each. A CPU does the same in `row_springs`. Kernels here and in
-    `xpbd` write x = x + y: what stands at an index from memory Taichi would add to by an atomic operation for +=.
+    A block of a GPU's threads solves a piece by parallel cyclic reduction (Hockney 1965; Zhang, Cohen & Owens 2010,
+    "Fast tridiagonal solvers on the GPU"), a row each; a thread of a CPU `LANES` pieces side by side, from end to end
+    and back (Thomas algorithm). Kernels here and in `xpbd` write x = x + y: what stands at an index from memory Taichi
+    would add to by an atomic operation for +=.
     """
 
     def __init__(self, springs: DeviceSprings) -> None:
         self.springs = springs
-        starts = springs.segment_start.to_numpy()
-        self._work = ThreadWork(*(ti.ndarray(ti.f32, springs.count) for _ in range(2)))
-        self._pieces = Pieces(springs.segment_start, springs.piece_of_colour, ti.ndarray(ti.i32, len(starts) - 1))
+        starts = springs.on_device.segment_start.to_numpy()
+        is_taut = ti.ndarray(ti.i32, len(starts) - 1)
+        self._work: ThreadWork = with_room(ThreadWork, springs.count, is_taut=is_taut)
         self._found = ti.ndarray(ti.i32, 2)
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
@@ -66,20 +65,10 @@ class ThreadSolver:
 
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
-        springs = self.springs
-        springs.contract(state.nodes, state.displacement)
+        springs, nodes, step = self.springs, state.nodes, self.springs.first_colours.step
+        springs.contract(nodes, state.displacement)
         for colour in springs.first_colours:
-            solve_threads(
-                springs.on_device,
-                self._pieces,
-                colour,
-                state.nodes,
-                dt,
-                int(is_first),
-                self._work,
-                self._rows,
-                springs.first_colours.step,
-            )
+            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, self._rows, step)
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for fixed directions.
@@ -88,19 +77,9 @@ class ThreadSolver:
         x + beta (u - u*) for displacements u and those of the prediction u*: (M + beta dt² K) (u - u*) = M (u~ - u*)
         with u~ of the fixed directions, where K is the Laplacian of the thread with weights T/|d|.
         """
-        springs = self.springs
+        springs, step = self.springs, self.springs.first_colours.step
         for colour in springs.first_colours:
-            straighten_threads(
-                springs.on_device,
-                self._pieces,
-                colour,
-                state.nodes,
-                state.motion,
-                dt,
-                self._work,
-                self._rows,
-                springs.first_colours.step,
-            )
+            straighten_threads(springs.on_device, colour, state.nodes, dt, self._work, self._rows, step)
 
     def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
         """Asks for the largest excess of a spring [rest lengths], and how many have not converged
@@ -126,11 +105,11 @@ def tension_to_turn(stress, weight):
 
 
 @func
-def corrected(i: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32) -> ti.math.vec3:
+def corrected(i: ti.i32, nodes: Nodes, dt: ti.f32) -> ti.math.vec3:
     """By how much springs have changed the displacement of a node so far; by nothing if it is pinned."""
     change = ti.math.vec3(0.0)
     if nodes.inverse_mass[i] > 0.0:
-        change = nodes.displacement[i] - (motion.carry[i] + dt * motion.velocity[i])
+        change = nodes.displacement[i] - (nodes.carry[i] + dt * nodes.velocity[i])
     return change
 
 
@@ -164,10 +143,105 @@ def reduced_row(j, rows: ti.template(), lower, diagonal, upper, right, shared: t
     return right / diagonal
 
 
-@kernel
+@func
+def solve_forth(
+    first: ti.i32, end: ti.i32, springs: SpringArrays, nodes: Nodes, dt: ti.f32, is_first: ti.i32, work: ThreadWork
+):
+    """Eliminate the rows of `LANES` pieces, or of those that are left of a colour, from their first springs on.
+
+    Loops over lanes that read and write local blocks alone become vector instructions. `tension` keeps lengths.
+    """
+    start, count, longest = ti.Vector.zero(ti.i32, LANES), ti.Vector.zero(ti.i32, LANES), 0
+    u, x, n = ti.Matrix.zero(ti.f32, 3, LANES), ti.Matrix.zero(ti.i32, 3, LANES), ti.Matrix.zero(ti.f32, 3, LANES)
+    before, after = ti.Matrix.zero(ti.f32, 3, LANES), ti.Matrix.zero(ti.f32, 3, LANES)
+    w_i, w_j, missing = ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES)
+    compliance, pivot = ti.Vector.zero(ti.f32, LANES) + 1.0, ti.Vector.zero(ti.f32, LANES)  # as without a spring
+    change, factor, length = ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES), ti.Vector.zero(ti.f32, LANES)
+    for at in range(ti.min(LANES, end - first)):
+        start[at] = springs.segment_start[first + at]
+        count[at] = springs.segment_start[first + at + 1] - start[at]
+        longest = ti.max(longest, count[at])
+        i = springs.nodes[2 * start[at]]
+        set_column(u, at, nodes.displacement[i])
+        set_column(x, at, nodes.lattice[i])
+        w_i[at] = nodes.inverse_mass[i]
+    for k in range(longest):
+        for at in range(LANES):
+            if k < count[at]:
+                s = start[at] + k
+                j, law = springs.nodes[2 * s + 1], springs.law[s]
+                set_column(before, at, nodes.quantum * ti.cast(column(x, at) - nodes.lattice[j], ti.f32))
+                set_column(after, at, column(before, at) + (column(u, at) - nodes.displacement[j]))
+                set_column(u, at, nodes.displacement[j])
+                set_column(x, at, nodes.lattice[j])
+                w_j[at], compliance[at] = nodes.inverse_mass[j], 1.0 / (law[1] * dt * dt)
+                missing[at] = law[0] - springs.shift[s] - ti.select(is_first, 0.0, compliance[at] * work.multiplier[s])
+        for at in range(LANES):
+            length[at] = ti.max(column(after, at).norm(), TINY_LENGTH)
+            direction = direction_of(column(before, at), column(after, at) / length[at])
+            coupling = -w_i[at] * direction.dot(column(n, at))  # n is of the spring before
+            factor[at] = coupling * pivot[at]
+            pivot[at] = 1.0 / (w_i[at] + w_j[at] + compliance[at] - coupling * factor[at])
+            change[at] = (missing[at] - length[at] - coupling * change[at]) * pivot[at]
+            w_i[at] = w_j[at]
+            set_column(n, at, direction)
+        for at in range(LANES):
+            if k < count[at]:
+                s = start[at] + k
+                work.direction[s], work.tension[s] = column(n, at), length[at]
+                work.change[s], work.factor[s] = change[at], factor[at]
+
+
+@func
+def solve_back(p: ti.i32, springs: SpringArrays, nodes: Nodes, is_first: ti.i32, work: ThreadWork):
+    """The changes of a piece's multipliers from its last spring on, and where nodes move."""
+    first, end = springs.segment_start[p], springs.segment_start[p + 1]
+    change, factor, after, is_taut = 0.0, 0.0, ti.math.vec3(0.0), 0  # `after`: the push of the spring after the node
+    j = springs.nodes[2 * end - 1]
+    for k in range(end - first):
+        s = end - 1 - k
+        i = springs.nodes[2 * s]
+        w_i, w_j = nodes.inverse_mass[i], nodes.inverse_mass[j]
+        change = work.change[s] - factor * change
+        factor = work.factor[s]
+        push = change * work.direction[s]
+        nodes.displacement[j] = nodes.displacement[j] + w_j * (after - push)
+        multiplier = ti.select(is_first, 0.0, work.multiplier[s]) + change
+        tension = tension_to_turn(-multiplier / work.tension[s], w_i + w_j)
+        work.multiplier[s], work.tension[s] = multiplier, tension
+        if tension > 0.0:
+            is_taut = 1
+        j, after = i, push
+    nodes.displacement[j] = nodes.displacement[j] + nodes.inverse_mass[j] * after
+    work.is_taut[p] = is_taut
+
+
+@func
+def straighten_piece(p: ti.i32, springs: SpringArrays, nodes: Nodes, dt: ti.f32, work: ThreadWork):
+    """Solve a piece forth and back; `direction` and `factor` of a spring hold what is solved at its first node."""
+    first, end = springs.segment_start[p], springs.segment_start[p + 1]
+    e, share, tension = ti.math.vec3(0.0), 0.0, 0.0
+    for s in range(first, end + 1):
+        i = springs.nodes[ti.min(2 * s, 2 * end - 1)]
+        change, w_i = corrected(i, nodes, dt), nodes.inverse_mass[i]
+        pull = w_i * tension
+        tension = ti.select(s < end, work.tension[ti.min(s, end - 1)], 0.0)
+        pivot = 1.0 / (1.0 + w_i * tension + pull * (1.0 - share))
+        e, share = pivot * (change + pull * e), pivot * w_i * tension
+        if s < end:
+            work.direction[s], work.factor[s] = e, share
+        else:
+            nodes.displacement[i] = nodes.displacement[i] + (e - change)
+    for k in range(end - first):
+        s = end - 1 - k
+        i = springs.nodes[2 * s]
+        e = work.direction[s] + work.factor[s] * e
+        nodes.displacement[i] = nodes.displacement[i] + (e - corrected(i, nodes, dt))
+
+
+@large_kernel
 def solve_threads(
     springs: SpringArrays,
-    pieces: Pieces,
     first: ti.i32,
     nodes: Nodes,
     dt: ti.f32,
@@ -176,108 +250,127 @@ def solve_threads(
     rows: ti.template(),
     colours: ti.template(),
 ):
-    """So many colours, from `first` on, with `rows` threads of a GPU for each piece, and each piece exactly:
+    """So many colours, from `first` on, each piece exactly, by `rows` threads of a GPU:
 
         (w_s + w_s+1 + a) D_s - w_s n_s-1.n_s D_s-1 - w_s+1 n_s.n_s+1 D_s+1 = -C_s - a l_s,   a = 1/(k dt²)
 
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
     """
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(pieces.piece_of_colour, first, colours, rows)
+    threads = ti.static(rows if runs_on_gpu() else 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
-        ti.loop_config(block_dim=rows)
-        for row in range(begin, end):
-            p, k = row // rows, row % rows
-            s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
-            one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-            three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-            of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-            i, j, w_i, w_j, n, length, compliance, before = 0, 0, 0.0, 0.0, ti.math.vec3(0.0), 1.0, 0.0, 0.0
-            if k < count:
-                i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-                w_i, w_j = nodes.inverse_mass[i], nodes.inverse_mass[j]
-                at_start = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
-                d = at_start + (nodes.displacement[i] - nodes.displacement[j])
-                length = ti.max(d.norm(), TINY_LENGTH)
-                n = direction_of(at_start, d / length)
-                compliance = 1.0 / (springs.law[s][1] * dt * dt)
-                if not is_first:
-                    before = work.multiplier[s]
-            of_x[k], of_y[k], of_z[k] = n.x, n.y, n.z
-            if k == 0:
-                pieces.is_taut[p] = 0
-            ti.simt.block.sync()
-            lower, diagonal, upper, missing = 0.0, 1.0, 0.0, 0.0
-            if k < count:
-                diagonal = w_i + w_j + compliance
-                missing = springs.law[s][0] - springs.shift[s] - length - compliance * before
-                if k > 0:
-                    lower = -w_i * n.dot(ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1]))
-                if k + 1 < count:
-                    upper = -w_j * n.dot(ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1]))
-            change = reduced_row(
-                k, rows, lower, diagonal, upper, ti.math.vec3(missing, 0.0, 0.0), (one, two, three, of_x, of_y, of_z)
-            ).x
-            push = change * n
-            of_x[k], of_y[k], of_z[k] = push.x, push.y, push.z
-            ti.simt.block.sync()
-            if k < count:
-                moved = -push  # of the node that the spring leads to, which the next one leads from
-                if k + 1 < count:
-                    moved += ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1])
-                nodes.displacement[j] = nodes.displacement[j] + w_j * moved
+        if ti.static(runs_on_gpu()):
+            ti.loop_config(block_dim=rows)
+            for row in range(begin, end):
+                p, k = row // rows, row % rows
+                s, count = springs.segment_start[p] + k, springs.segment_start[p + 1] - springs.segment_start[p]
+                one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
+                three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
+                of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
+                i, j, w_i, w_j, n, length, compliance, before = 0, 0, 0.0, 0.0, ti.math.vec3(0.0), 1.0, 0.0, 0.0
+                if k < count:
+                    i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+                    w_i, w_j = nodes.inverse_mass[i], nodes.inverse_mass[j]
+                    at_start = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
+                    d = at_start + (nodes.displacement[i] - nodes.displacement[j])
+                    length = ti.max(d.norm(), TINY_LENGTH)
+                    n = direction_of(at_start, d / length)
+                    compliance = 1.0 / (springs.law[s][1] * dt * dt)
+                    if not is_first:
+                        before = work.multiplier[s]
+                of_x[k], of_y[k], of_z[k] = n.x, n.y, n.z
                 if k == 0:
-                    nodes.displacement[i] = nodes.displacement[i] + w_i * push
-                work.multiplier[s] = before + change
-                work.tension[s] = tension_to_turn(-(before + change) / length, w_i + w_j)
-                if work.tension[s] > 0.0:
-                    pieces.is_taut[p] = 1
-            ti.simt.block.sync()
+                    work.is_taut[p] = 0
+                ti.simt.block.sync()
+                lower, diagonal, upper, missing = 0.0, 1.0, 0.0, 0.0
+                if k < count:
+                    diagonal = w_i + w_j + compliance
+                    missing = springs.law[s][0] - springs.shift[s] - length - compliance * before
+                    if k > 0:
+                        lower = -w_i * n.dot(ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1]))
+                    if k + 1 < count:
+                        upper = -w_j * n.dot(ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1]))
+                change = reduced_row(
+                    k,
+                    rows,
+                    lower,
+                    diagonal,
+                    upper,
+                    ti.math.vec3(missing, 0.0, 0.0),
+                    (one, two, three, of_x, of_y, of_z),
+                ).x
+                push = change * n
+                of_x[k], of_y[k], of_z[k] = push.x, push.y, push.z
+                ti.simt.block.sync()
+                if k < count:
+                    moved = -push  # of the node that the spring leads to, which the next one leads from
+                    if k + 1 < count:
+                        moved += ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1])
+                    nodes.displacement[j] = nodes.displacement[j] + w_j * moved
+                    if k == 0:
+                        nodes.displacement[i] = nodes.displacement[i] + w_i * push
+                    work.multiplier[s] = before + change
+                    work.tension[s] = tension_to_turn(-(before + change) / length, w_i + w_j)
+                    if work.tension[s] > 0.0:
+                        work.is_taut[p] = 1
+                ti.simt.block.sync()
+        else:
+            for place in range((end - begin + LANES - 1) // LANES * LEAST_RUN):
+                if place % LEAST_RUN == 0:
+                    p = begin + place // LEAST_RUN * LANES
+                    solve_forth(p, end, springs, nodes, dt, is_first, work)
+                    for side_by_side in range(p, ti.min(p + LANES, end)):
+                        solve_back(side_by_side, springs, nodes, is_first, work)
 
 
-@kernel
+@large_kernel
 def straighten_threads(
     springs: SpringArrays,
-    pieces: Pieces,
     first: ti.i32,
     nodes: Nodes,
-    motion: NodeMotion,
     dt: ti.f32,
     work: ThreadWork,
     rows: ti.template(),
     colours: ti.template(),
 ):
     """Solve (1 + w_i (t_i-1 + t_i)) e_i - w_i t_i-1 e_i-1 - w_i t_i e_i+1 = e~_i in each taut piece of some colours,
-    with `rows` threads of a GPU for each, one for each of its nodes.
+    by `rows` threads of a GPU, one for each of its nodes.
 
     e~ is by how much springs have changed the displacements, e by how much they shall have; t_i is the tension of the
     spring from node i on.
     """
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(pieces.piece_of_colour, first, colours, rows)
+    threads = ti.static(rows if runs_on_gpu() else 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
-        ti.loop_config(block_dim=rows)
-        for row in range(begin, end):
-            p, k = row // rows, row % rows
-            s, count = pieces.segment_start[p] + k, pieces.segment_start[p + 1] - pieces.segment_start[p]
-            one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-            three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-            of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-            if pieces.is_taut[p]:
-                i, before, after, change = -1, 0.0, 0.0, ti.math.vec3(0.0)
-                if k < count:
-                    i = springs.nodes[2 * s]
-                    after = nodes.inverse_mass[i] * work.tension[s]
-                elif k == count:
-                    i = springs.nodes[2 * s - 1]
-                if i >= 0:
-                    change = corrected(i, nodes, motion, dt)
-                    if k > 0:
-                        before = nodes.inverse_mass[i] * work.tension[s - 1]
-                turned = reduced_row(
-                    k, rows, -before, 1.0 + before + after, -after, change, (one, two, three, of_x, of_y, of_z)
-                )
-                if i >= 0:
-                    nodes.displacement[i] = nodes.displacement[i] + (turned - change)
+        if ti.static(runs_on_gpu()):
+            ti.loop_config(block_dim=rows)
+            for row in range(begin, end):
+                p, k = row // rows, row % rows
+                s, count = springs.segment_start[p] + k, springs.segment_start[p + 1] - springs.segment_start[p]
+                one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
+                three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
+                of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
+                if work.is_taut[p]:
+                    i, before, after, change = -1, 0.0, 0.0, ti.math.vec3(0.0)
+                    if k < count:
+                        i = springs.nodes[2 * s]
+                        after = nodes.inverse_mass[i] * work.tension[s]
+                    elif k == count:
+                        i = springs.nodes[2 * s - 1]
+                    if i >= 0:
+                        change = corrected(i, nodes, dt)
+                        if k > 0:
+                            before = nodes.inverse_mass[i] * work.tension[s - 1]
+                    turned = reduced_row(
+                        k, rows, -before, 1.0 + before + after, -after, change, (one, two, three, of_x, of_y, of_z)
+                    )
+                    if i >= 0:
+                        nodes.displacement[i] = nodes.displacement[i] + (turned - change)
+        else:
+            for p in range(begin, end):
+                if work.is_taut[p]:
+                    straighten_piece(p, springs, nodes, dt, work)
 
 
 @func

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import taichi as ti
 
-from sim.cloth.bundles import Lattice, Nodes, SpringArrays
+from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, sum_over_cells
 from sim.cloth.device_springs import DeviceSprings, coefficient, separation
 from sim.cloth.state import ClothState
@@ -30,18 +30,9 @@ class ClothTotals:
 
     def of_nodes(self, gravity: tuple[float, float, float]) -> dict[str, float]:
         """Momentum, energies but that of springs, largest speed; how many nodes are not finite, and how many lost."""
-        state = self._state
+        state, share = self._state, self._of_nodes.over(self._state.vertex_count)
         results = self._of_nodes.unpack(
-            sum_over_nodes(
-                state.position,
-                state.lattice,
-                state.velocity,
-                state.mass,
-                state.vertex_count,
-                state.limit,
-                ti.math.vec3(*gravity),
-                self._of_nodes.over(state.vertex_count),
-            )
+            sum_over_nodes(state.nodes, state.position, state.mass, state.vertex_count, state.limit, gravity, share)
         )
         speed_squared, *sums = (float(value) for value in results)
         names = ("momentum_x", "momentum_y", "momentum_z", "kinetic_energy", "potential_energy", "not_finite", "lost")
@@ -53,27 +44,18 @@ class ClothTotals:
         for springs in self._springs:
             springs.contract(state.nodes, state.carry)
             share = self._of_springs.over(springs.count)
-            found.append(
-                sum_over_springs(springs.on_device, state.nodes, state.carry, springs.count, springs.arity, share)
-            )
+            found.append(sum_over_springs(springs.on_device, state.nodes, springs.count, springs.arity, share))
         for cells in self._cells:
-            cells.measure_strains(state.nodes, state.motion, is_damped=False)
+            cells.measure_strains(state.nodes, is_damped=False)
             share, law = self._of_springs.over(cells.count), (cells.on_device, cells.mesh)
-            found.append(sum_over_cells(*law, state.nodes, state.carry, cells.count, cells.arity, share))
+            found.append(sum_over_cells(*law, state.nodes, cells.count, cells.arity, share))
         strains, energies = zip(*((float(each[0]), float(each[1])) for each in found), strict=True)
         return {"elastic_energy": sum(energies), "max_strain": max(0.0, *strains)}
 
 
 @kernel
 def sum_over_nodes(
-    position: Vectors,
-    lattice: Lattice,
-    velocity: Vectors,
-    mass: Floats,
-    count: ti.i32,
-    limit: ti.i32,
-    gravity: ti.math.vec3,
-    share: Share,
+    nodes: Nodes, position: Vectors, mass: Floats, count: ti.i32, limit: ti.i32, gravity: ti.math.vec3, share: Share
 ) -> Results:
     """Largest squared speed; momentum, kinetic and potential energy; how many are not finite, or at the ends."""
     (tree,) = ti.static((share.tree,))
@@ -89,7 +71,7 @@ def sum_over_nodes(
         for k in range(share.items):
             i = lane * share.lane_step + k * share.item_step
             if i < count:
-                v_i = velocity[i]
+                v_i = nodes.velocity[i]
                 squared = v_i.dot(v_i)
                 if is_finite(squared):
                     fastest = ti.max(fastest, squared)
@@ -98,7 +80,7 @@ def sum_over_nodes(
                     potential -= mass[i] * gravity.dot(position[i])
                 else:
                     bad += 1.0
-                if ti.abs(lattice[i]).max() >= limit:
+                if ti.abs(nodes.lattice[i]).max() >= limit:
                     lost += 1.0
         tree.partial[lane] = fastest
         for axis in ti.static(range(3)):
@@ -111,9 +93,7 @@ def sum_over_nodes(
 
 
 @kernel
-def sum_over_springs(
-    springs: SpringArrays, nodes: Nodes, carry: Vectors, count: ti.i32, arity: ti.template(), share: Share
-) -> Results:
+def sum_over_springs(springs: SpringArrays, nodes: Nodes, count: ti.i32, arity: ti.template(), share: Share) -> Results:
     """Largest strain of springs with two nodes; elastic energy."""
     (tree,) = ti.static((share.tree,))
     if ti.static(not runs_on_gpu()):
@@ -126,7 +106,7 @@ def sum_over_springs(
             if s < count:
                 d = separation(springs, nodes, s, arity)
                 for a in ti.static(range(arity)):
-                    d += coefficient(springs, s, arity, a) * carry[springs.nodes[arity * s + a]]
+                    d += coefficient(springs, s, arity, a) * nodes.carry[springs.nodes[arity * s + a]]
                 error = d.norm() - springs.law[s][0]
                 energy += 0.5 * springs.law[s][1] * error * (error + springs.shift[s])
                 if ti.static(arity == 2):

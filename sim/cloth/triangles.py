@@ -13,28 +13,21 @@ from sim.core.bundles import func, with_room
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, LaneReduction, Results, Share, reduced_tree, runs_on_gpu
 
-ITERATIONS_AT_ONCE = 4
-"""Iterations between two looks at how far the last ones led."""
-
-MOST_ITERATIONS = 200
-"""More are only asked for by steps in which a wave crosses hundreds of triangles."""
+ITERATIONS_AT_ONCE = 4  # iterations between two looks at how far the last ones led
+MOST_ITERATIONS = 200  # more are only asked for by steps in which a wave crosses hundreds of triangles
 
 TOLERANCE = 0.03
 """Of the displacement by triangles in a step, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
 
-LEAST_ACCELERATION = 1.0
-"""By triangles, of which `TOLERANCE` is at least [m/s²]: 0.3 % of the weight."""
+LEAST_ACCELERATION = 1.0  # by triangles, of which `TOLERANCE` is at least [m/s²]: 0.3 % of the weight
 
 ROOT_HALF = 0.5**0.5
 
 BLOCK_SHARE = OWN_SHARE + (1.0 - OWN_SHARE) / 6.0
 """What blocks of nodes have of the stiffness of triangles, on equal triangles."""
 
-TINY_ENERGY = 1.0e-37
-"""Least divisor of energies [kg m²]: without any, there is nothing to solve."""
-
-HELD = 1.0e30
-"""Mass of held nodes in the sums over pieces [kg]."""
+TINY_ENERGY = 1.0e-37  # least divisor of energies [kg m²]: without any, there is nothing to solve
+HELD = 1.0e30  # mass of held nodes in the sums over pieces [kg]
 
 
 class TriangleSolver:
@@ -92,7 +85,7 @@ class TriangleSolver:
         """
         system, state = self._system, self._state
         share = self._sums.over(system.own)
-        linearize(system, state.nodes, state.carry, dt)
+        linearize(system, state.nodes, dt)
         begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share)
         self._left = 1.0
         if is_first:
@@ -207,15 +200,15 @@ def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.ve
 
 
 @kernel
-def linearize(system: TriangleSystem, nodes: Nodes, carry: Vectors, dt: ti.f32):
+def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32):
     """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
 
     Damping adds tau times the rate at which the prediction strains.
     """
     cells, mesh, frames, work = ti.static((system.cells, system.mesh, system.frames, system.work))
     for s in range(system.count):
-        start_u = derivative(cells.along, cells, nodes, carry, s, TRIANGLE)
-        start_v = derivative(cells.across, cells, nodes, carry, s, TRIANGLE)
+        start_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
+        start_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
         d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
         d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
         rate = cells.law[s][3] / dt
@@ -285,14 +278,7 @@ def sum_products(system: TriangleSystem, product: Vectors, share: Share):
 
 
 @kernel
-def begin_iteration(
-    system: TriangleSystem,
-    nodes: Nodes,
-    elastic: Vectors,
-    dt: ti.f32,
-    is_first: ti.i32,
-    share: Share,
-):
+def begin_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, dt: ti.f32, is_first: ti.i32, share: Share):
     """Residual at the start, and inverse blocks; in the first solve of a step the start is a multiple of `elastic`, and
     that is 0 from there on.
     """

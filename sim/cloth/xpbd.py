@@ -8,22 +8,19 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
+from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
 from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
-from sim.cloth.parameters import ClothParameters
-from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
 from sim.cloth.triangles import TriangleSolver
-from sim.core.arrays import Integers, Vectors
+from sim.core.arrays import Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, Share, Tree, device_lanes, reduced, runs_on_gpu
 
-QUANTITIES = 13
-"""Mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)."""
+QUANTITIES = 13  # mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)
 
 LEAST_INERTIA = 1.0e-6
 """About its long axis a cloth counts as no thinner than this, as a share of the sum of its moments of inertia [-]."""
@@ -63,7 +60,7 @@ class AngularMomentumCorrection:
             first, end = (int(node) for node in state.host.first_node[cloth : cloth + 2])
             count = end - first if state.is_free[cloth] else 0
             share = Share(lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._tree)
-            return_angular_momentum(state.nodes, state.motion, dt, first, count, share, self._turn)
+            return_angular_momentum(state.nodes, dt, first, count, share, self._turn)
         self._is_warm = True
 
 
@@ -75,15 +72,7 @@ def three(tree: Tree, first: ti.i32) -> ti.math.vec3:
 
 
 @kernel
-def return_angular_momentum(
-    nodes: Nodes,
-    motion: NodeMotion,
-    dt: ti.f32,
-    first: ti.i32,
-    count: ti.i32,
-    share: Share,
-    turn: Vectors,
-):
+def return_angular_momentum(nodes: Nodes, dt: ti.f32, first: ti.i32, count: ti.i32, share: Share, turn: Vectors):
     """Rotate the nodes of a cloth so that the corrections of its springs have no angular momentum.
 
     Moments are about the first node; `turn` becomes the rotation, and the centre of mass from there.
@@ -101,7 +90,7 @@ def return_angular_momentum(
                 i = first + n
                 m_i = 1.0 / nodes.inverse_mass[i]
                 r_i = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[first], ti.f32)
-                e_i = nodes.displacement[i] - (motion.carry[i] + dt * motion.velocity[i])
+                e_i = nodes.displacement[i] - (nodes.carry[i] + dt * nodes.velocity[i])
                 mass += m_i
                 moment += m_i * r_i
                 squares += m_i * r_i * r_i
@@ -160,25 +149,16 @@ class XPBDSprings:
     """
 
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
-        self._state, self._springs, self._cells = state, springs, cells
+        self._state = state
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
-        self._rectangles = {
-            number: RectangleSprings(state, grid, int(state.host.first_node[number]))
-            for number, grid in rectangles_in_rows(state.host).items()
-        }
-        listed = [family for family in springs if not family.cloths & self._rectangles.keys()]
-        self._bends = [family for family in listed if family.arity > PAIR]
-        self._shears = [
-            family for family in cells if family.arity != TRIANGLE and not family.cloths & self._rectangles.keys()
-        ]
+        self._bends = [family for family in springs if family.arity > PAIR]
+        self._shears = [family for family in cells if family.arity != TRIANGLE]
         self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
-        self._threads = [ThreadSolver(family) for family in listed if family.in_segments]
+        self._threads = [ThreadSolver(family) for family in springs if family.in_segments]
 
-    def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
-        """Stiffness of rectangles and mass of meshes as they are now; lists of springs hold their stiffness."""
-        for number, rectangle in self._rectangles.items():
-            rectangle.take_parameters(cloths[number])
+    def take_parameters(self) -> None:
+        """Mass of meshes as it is now; lists of springs hold their stiffness."""
         for triangles in self._triangles:
             triangles.take_parameters()
 
@@ -192,7 +172,6 @@ class XPBDSprings:
 
         def answer() -> NDArray[np.float64]:
             found = [(cloths, *excess()) for cloths, excess in asked]
-            found += [({number}, *rectangle.excess(dt)) for number, rectangle in self._rectangles.items()]
             found += [(triangles.cloths, *triangles.excess()) for triangles in self._triangles]
             self._unconverged = sum(count for *_, count in found)
             largest = np.zeros(len(self._state.names))
@@ -218,53 +197,29 @@ class XPBDSprings:
         come first in the sweep, and what gravity predicts does not bend the cloth; they are damped there.
         """
         state = self._state
-        for springs in self._springs:
-            if springs.arity > PAIR or not springs.is_damped:
-                continue
+        for springs in (threads.springs for threads in self._threads if threads.springs.is_damped):
             for colour in springs.first_colours:
-                damp_springs(
-                    springs.on_device,
-                    springs.segment_start,
-                    springs.piece_of_colour,
-                    colour,
-                    state.nodes,
-                    state.motion,
-                    dt,
-                    springs.arity,
-                    springs.first_colours.step,
-                )
-        for cells in self._cells:
-            if cells.arity != TRIANGLE and cells.is_damped:
-                for colour in cells.first_colours:
-                    damp_shears(
-                        cells.on_device,
-                        cells.cell_of_colour,
-                        colour,
-                        state.nodes,
-                        state.motion,
-                        dt,
-                        cells.first_colours.step,
-                    )
+                damp_threads(springs.on_device, colour, state.nodes, dt, springs.first_colours.step)
+        for cells in (each for each in self._shears if each.is_damped):
+            for colour in cells.first_colours:
+                damp_shears(cells.on_device, colour, state.nodes, dt, cells.first_colours.step)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
-        for springs in self._bends:
-            self._solve_bends(springs, dt)
+        for bends in self._bends:
+            step, nodes = bends.first_colours.step, self._state.nodes
+            for colour in bends.first_colours:
+                solve_bends(bends.on_device, colour, nodes, dt * dt, 1.0 / dt, bends.arity, step)
         for sweep in range(sweeps.max()):
             self._sweep_lists(self._shears, dt, sweeps > sweep, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
-        for number, rectangle in self._rectangles.items():
-            rectangle.displace(dt, int(sweeps[number]))
         self._momentum.restore(dt)
 
     def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
         """Solve what bears tension in some cloths once more, after contacts have pushed: threads, and the triangles of
         meshes."""
         self._sweep_lists([], dt, cloths, is_first=False)
-        for number, rectangle in self._rectangles.items():
-            if cloths[number]:
-                rectangle.sweep(dt)
 
     def _sweep_lists(
         self, solved: Sequence[DeviceCells], dt: float, cloths: NDArray[np.bool_], *, is_first: bool
@@ -273,35 +228,13 @@ class XPBDSprings:
         for cells in solved:
             if not cloths[list(cells.cloths)].any():
                 continue
-            solve_shears(
-                cells.on_device,
-                cells.cell_of_colour,
-                self._state.nodes,
-                dt * dt,
-                int(is_first),
-                cells.multiplier,
-                cells.first_colours.stop,
-            )
+            solve_shears(cells.on_device, self._state.nodes, dt * dt, int(is_first), cells.first_colours.stop)
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
                 threads.displace(self._state, dt, is_first=is_first)
         for triangles in self._triangles:
             if cloths[list(triangles.cloths)].any():
                 triangles.displace(dt, is_first=is_first)
-
-    def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
-        state = self._state
-        for colour in springs.first_colours:
-            solve_bends(
-                springs.on_device,
-                springs.piece_of_colour,
-                colour,
-                state.nodes,
-                dt * dt,
-                1.0 / dt,
-                springs.arity,
-                springs.first_colours.step,
-            )
 
 
 @func
@@ -340,7 +273,6 @@ def solve_bend(s: ti.i32, springs: SpringArrays, nodes: Nodes, dt_squared: ti.f3
 @kernel
 def solve_bends(
     springs: SpringArrays,
-    spring_of_colour: Integers,
     colour: ti.i32,
     nodes: Nodes,
     dt_squared: ti.f32,
@@ -350,51 +282,27 @@ def solve_bends(
 ):
     """The bend springs of so many colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(spring_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
             solve_bend(s, springs, nodes, dt_squared, rate, arity)
 
 
-@func
-def damp_spring(s: ti.i32, springs: SpringArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, arity: ti.template()):
-    """Implicit Euler of the force -tau k dC/dt along a spring."""
-    strength = springs.law[s][1] * springs.law[s][2] * dt
-    d = separation(springs, nodes, s, arity)
-    rate = ti.math.vec3(0.0)
-    weight = 0.0
-    for a in ti.static(range(arity)):
-        c_a = coefficient(springs, s, arity, a)
-        i = springs.nodes[arity * s + a]
-        d += c_a * motion.carry[i]
-        rate += c_a * motion.velocity[i]
-        weight += c_a * c_a * nodes.inverse_mass[i]
-    squared = d.dot(d)
-    if squared > TINY_LENGTH * TINY_LENGTH:
-        impulse = -strength / (strength * weight + 1.0) * d.dot(rate) / squared * d
-        for a in ti.static(range(arity)):
-            i = springs.nodes[arity * s + a]
-            motion.velocity[i] = (
-                motion.velocity[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
-            )
-
-
 @kernel
-def damp_springs(
-    springs: SpringArrays,
-    segment_start: Integers,
-    piece_of_colour: Integers,
-    colour: ti.i32,
-    nodes: Nodes,
-    motion: NodeMotion,
-    dt: ti.f32,
-    arity: ti.template(),
-    colours: ti.template(),
-):
-    """The springs of so many colours, one colour after the other, and one by one within a piece."""
+def damp_threads(springs: SpringArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, colours: ti.template()):
+    """Implicit Euler of the forces -tau k dC/dt along the springs of so many colours, one colour after the other, and
+    one by one within a piece.
+    """
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(piece_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, colour, colours, 1)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for piece in range(begin, end):
-            for s in range(segment_start[piece], segment_start[piece + 1]):
-                damp_spring(s, springs, nodes, motion, dt, arity)
+            for s in range(springs.segment_start[piece], springs.segment_start[piece + 1]):
+                i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+                w_i, w_j, v_i, v_j = nodes.inverse_mass[i], nodes.inverse_mass[j], nodes.velocity[i], nodes.velocity[j]
+                d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
+                d += nodes.carry[i] - nodes.carry[j]
+                squared, strength = d.dot(d), springs.law[s][1] * springs.law[s][2] * dt
+                if squared > TINY_LENGTH * TINY_LENGTH:
+                    impulse = -strength / (strength * (w_i + w_j) + 1.0) * d.dot(v_i - v_j) / squared * d
+                    nodes.velocity[i], nodes.velocity[j] = v_i + w_i * impulse, v_j - w_j * impulse

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import taichi as ti
 
-from sim.cloth.air import WIND, Triangles
+from sim.cloth.air import WIND
+from sim.cloth.bundles import Triples
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import bundle, func
 from sim.core.host_access import copied
@@ -48,7 +49,7 @@ class Box(NamedTuple):
 class Hanging(NamedTuple):
     """The triangles of all cloths, (k,) each, and what they are told of the air; see `ClothAir`."""
 
-    triangles: Triangles
+    triangles: Triples
     density: Floats
     source: Integers
     velocity: Vectors

@@ -77,7 +77,7 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
     if solver.contacts is not None:
         solver.contacts.resolve(state, dt, lambda: lambda: False)
     allowed = state.displacement.to_numpy().astype(np.float64)
-    finish_step(state.nodes, state.motion, state.position, state.limit, dt, solver._no_reasons)
+    finish_step(state.nodes, state.position, state.limit, dt, solver._no_reasons)
     return allowed
 
 

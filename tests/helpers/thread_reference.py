@@ -1,20 +1,31 @@
-"""Threads of rectangles in lists, in float64 with whole matrices: what the kernels for GPUs and in rows compute."""
+"""Threads of rectangles in float64 with whole matrices: what the kernels compute."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
+from sim.cloth import threads
+from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
 from sim.cloth.threads import LEAST_ALIKE, STRAIGHTENED, TURNED_EXPLICITLY
 
 Floats = NDArray[np.float64]
 
 
+@contextmanager
+def threads_in_float64() -> Iterator[None]:
+    """Solvers solve and straighten threads by these functions meanwhile."""
+    with pytest.MonkeyPatch.context() as patch:
+        for solve in (solve_threads, straighten_threads):
+            patch.setattr(threads, solve.__name__, solve)
+        yield
+
+
 def solve_threads(
     springs: SpringArrays,
-    pieces: Pieces,
     first: int,
     nodes: Nodes,
     dt: float,
@@ -27,8 +38,8 @@ def solve_threads(
     law, shift, multiplier, tension = (
         read(each) for each in (springs.law, springs.shift, work.multiplier, work.tension)
     )
-    taut = pieces.is_taut.to_numpy()
-    for piece, own, chain in pieces_of(springs, pieces, first, colours):
+    taut = work.is_taut.to_numpy()
+    for piece, own, chain in pieces_of(springs, first, colours):
         at_start = -nodes.quantum * np.diff(lattice[chain], axis=0)
         d = at_start - np.diff(u[chain], axis=0)
         length, start_length = (np.linalg.norm(each, axis=1) for each in (d, at_start))
@@ -49,26 +60,24 @@ def solve_threads(
         too_much = stress * weight > TURNED_EXPLICITLY
         tension[own] = np.where(too_much, STRAIGHTENED * (stress - TURNED_EXPLICITLY / np.maximum(weight, 1e-30)), 0.0)
         taut[piece] = too_much.any()
-    pieces.is_taut.from_numpy(taut)
+    work.is_taut.from_numpy(taut)
     for array, values in ((nodes.displacement, u), (work.multiplier, multiplier), (work.tension, tension)):
         array.from_numpy(values.astype(np.float32))
 
 
 def straighten_threads(
     springs: SpringArrays,
-    pieces: Pieces,
     first: int,
     nodes: Nodes,
-    motion: NodeMotion,
     dt: float,
     work: ThreadWork,
     _rows: int,
     colours: int,
 ) -> None:
     w, u, tension = (read(array) for array in (nodes.inverse_mass, nodes.displacement, work.tension))
-    predicted = read(motion.carry) + dt * read(motion.velocity)
-    for piece, own, chain in pieces_of(springs, pieces, first, colours):
-        if pieces.is_taut[piece]:
+    predicted = read(nodes.carry) + dt * read(nodes.velocity)
+    for piece, own, chain in pieces_of(springs, first, colours):
+        if work.is_taut[piece]:
             change = np.where(w[chain, None] > 0.0, u[chain] - predicted[chain], 0.0)
             t = tension[own]
             laplacian = np.diag(np.append(t, 0.0) + np.append(0.0, t)) - np.diag(t, 1) - np.diag(t, -1)
@@ -81,11 +90,9 @@ def read(array: Any) -> Floats:
     return values
 
 
-def pieces_of(
-    springs: SpringArrays, pieces: Pieces, first: int, colours: int
-) -> Iterator[tuple[int, slice, NDArray[np.int32]]]:
+def pieces_of(springs: SpringArrays, first: int, colours: int) -> Iterator[tuple[int, slice, NDArray[np.int32]]]:
     """Number, springs and nodes of each piece of some colours, one after the other."""
-    starts, piece_of_colour = pieces.segment_start.to_numpy(), pieces.piece_of_colour.to_numpy()
+    starts, piece_of_colour = springs.segment_start.to_numpy(), springs.piece_of_colour.to_numpy()
     ends = springs.nodes.to_numpy().reshape(-1, 2)
     for piece in range(piece_of_colour[first], piece_of_colour[first + colours]):
         own = slice(starts[piece], starts[piece + 1])

@@ -24,7 +24,7 @@ from cloth_scenes import (
 )
 
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
-from sim.cloth.stable_step import STEP_SAFETY
+from sim.cloth.springs import STEP_SAFETY
 from validation.sheet_energy import elastic_energy
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")

@@ -20,8 +20,7 @@ from contact_scenes import SPACE, cloth_of, contacts_of, displace, distances_to_
 from device_distances import measure_distances
 
 from sim.cloth.continuous_contacts import ContinuousContacts
-from sim.cloth.rigid_contact import RigidContact
-from sim.cloth.rigid_contact_bodies import CollisionBodies
+from sim.cloth.rigid_contact import CollisionBodies, RigidContact
 from sim.core.motion.paths import Poses
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.body_geometry import BodyGeometry

@@ -39,7 +39,7 @@ def test_patches_share_out_every_element_once_and_know_all_corners():
     vertices, corners = pieces(patches.vertices, patches.first_vertex), pieces(patches.corners, patches.first_corner)
     assert len(triangles) == patches.count > 2
     assert max(len(each) for each in triangles) <= TRIANGLES_PER_PATCH
-    for parts, whole in ((triangles, host.triangles), (edges, host.edges)):
+    for parts, whole in ((triangles, host.triangles), (edges, host.edges.nodes)):
         assert sorted(map(tuple, np.concatenate(parts).tolist())) == sorted(map(tuple, whole.tolist()))
     assert sorted(np.concatenate(vertices).tolist()) == list(range(117 + 4))
     cloth_of_patch = patches.cloth.to_numpy()

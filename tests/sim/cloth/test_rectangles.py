@@ -1,31 +1,13 @@
-"""Rectangles on a CPU are solved eight lines at a time: the same springs and the same air as in lists."""
+"""Threads of rectangles are solved from end to end, on a CPU eight side by side: as by whole matrices in float64."""
 
 import numpy as np
 import pytest
-import thread_reference
 from cloth_scenes import advance, cloth, rectangle, solver_of
+from thread_reference import threads_in_float64
 
-from sim.cloth import threads
-from sim.cloth.parameters import ClothParameters
 from sim.cloth.solver import ClothSolver
 
-pytestmark = pytest.mark.usefixtures("only_on_a_cpu")
-
-
-@pytest.fixture
-def only_on_a_cpu(taichi_cpu):
-    if taichi_cpu != "cpu":
-        pytest.skip("a GPU solves rectangles by lists")
-
-
-def by_lists(monkeypatch, *cloths: ClothParameters) -> ClothSolver:
-    """A solver that takes rectangles for meshes, as on a GPU, with threads in float64."""
-    for solve in (thread_reference.solve_threads, thread_reference.straighten_threads):
-        monkeypatch.setattr(threads, solve.__name__, solve)
-    with monkeypatch.context() as patch:
-        for module in ("sim.cloth.solver", "sim.cloth.xpbd"):
-            patch.setattr(f"{module}.rectangles_in_rows", lambda _host: {})
-        return solver_of(*cloths)
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
 
 def crumple(solver: ClothSolver, pinned: slice, *, spacing: float) -> None:
@@ -45,45 +27,44 @@ COUNTS = [(2, 2), (3, 2), (2, 11), (8, 8), (17, 9), (20, 140), (197, 5)]
 
 @pytest.mark.parametrize("counts", COUNTS)
 @pytest.mark.parametrize(("iterations", "poisson_ratio"), [(1, 0.0), (3, 0.5)])
-def test_rows_and_lists_move_nodes_to_the_same_places(counts, iterations, poisson_ratio, monkeypatch):
+def test_springs_move_nodes_to_the_same_places(counts, iterations, poisson_ratio):
     """Springs are stretched by a fifth and more here, so that tension across the threads is solved for, too."""
     spacing = 0.01
     sheet = rectangle(((counts[0] - 1) * spacing, (counts[1] - 1) * 1.5 * spacing), counts)
     keys = {"iterations": iterations, "poisson_ratio": poisson_ratio, "bend_stiffness": 1e-4, "bend_damping": 0.01}
-    parameters = cloth(shape=sheet, **keys)
-    rows, lists = solver_of(parameters), by_lists(monkeypatch, parameters)
-    for solver in (rows, lists):
-        crumple(solver, slice(counts[0] // 2), spacing=spacing)
-        solver.air.predict(solver.gravity, solver.stable_dt())
-    np.testing.assert_allclose(rows.state.velocity.to_numpy(), lists.state.velocity.to_numpy(), rtol=0.0, atol=1e-5)
-    before = lists.state.displacement.to_numpy()
-    np.testing.assert_allclose(rows.state.displacement.to_numpy(), before, rtol=0.0, atol=1e-8)
-    for solver in (rows, lists):
-        solver._integrator.displace(solver.stable_dt(), np.full(len(solver.parameters), iterations))
-    moved = np.abs(lists.state.displacement.to_numpy() - before).max()
-    difference = np.abs(rows.state.displacement.to_numpy() - lists.state.displacement.to_numpy()).max()
+    solver, expected = (solver_of(cloth(shape=sheet, **keys)) for _ in range(2))
+    for each in (solver, expected):
+        crumple(each, slice(counts[0] // 2), spacing=spacing)
+        each.air.predict(each.gravity, each.stable_dt())
+    before = expected.state.displacement.to_numpy()
+    solver._integrator.displace(solver.stable_dt(), np.array([iterations]))
+    with threads_in_float64():
+        expected._integrator.displace(expected.stable_dt(), np.array([iterations]))
+    moved = np.abs(expected.state.displacement.to_numpy() - before).max()
+    difference = np.abs(solver.state.displacement.to_numpy() - expected.state.displacement.to_numpy()).max()
     assert moved > 0.1 * spacing
     # The order of the springs is the same: what differs is rounding, which stiff pieces of thread enlarge.
     assert difference < 1e-3 * moved
 
 
-def test_tension_is_straightened_in_rows_as_in_lists(monkeypatch):
+def test_tension_is_straightened():
     """A strip pulled to twice its length with a wave across it: threads of a fixed direction would overshoot."""
-    parameters = cloth(shape=rectangle((0.7, 0.1), (90, 12)))
-    rows, lists = solver_of(parameters), by_lists(monkeypatch, parameters)
-    for solver in (rows, lists):
-        positions = solver.state.positions() * (2.0, 2.0, 1.0)
+    solver, expected = (solver_of(cloth(shape=rectangle((0.7, 0.1), (90, 12)))) for _ in range(2))
+    for each in (solver, expected):
+        positions = each.state.positions() * (2.0, 2.0, 1.0)
         positions[:, 2] += 0.002 * np.sin(np.arange(len(positions)) % 90)
-        solver.state.set_positions(positions)
-        solver.air.predict(solver.gravity, solver.stable_dt())
-        solver._integrator.displace(solver.stable_dt(), np.ones(len(solver.parameters), dtype=int))
-    assert lists._integrator._threads[0]._pieces.is_taut.to_numpy().any()
-    moved = lists.state.displacement.to_numpy()
-    difference = np.abs(rows.state.displacement.to_numpy() - moved).max()
+        each.state.set_positions(positions)
+        each.air.predict(each.gravity, each.stable_dt())
+    solver._integrator.displace(solver.stable_dt(), np.array([1]))
+    with threads_in_float64():
+        expected._integrator.displace(expected.stable_dt(), np.array([1]))
+    assert expected._integrator._threads[0]._work.is_taut.to_numpy().any()
+    moved = expected.state.displacement.to_numpy()
+    difference = np.abs(solver.state.displacement.to_numpy() - moved).max()
     assert difference < 1e-3 * np.abs(moved).max()
 
 
-def test_several_cloths_of_both_kinds_fall_alike(monkeypatch, tmp_path):
+def test_several_cloths_of_both_kinds_fall_alike(tmp_path):
     """Two rectangles with a mesh between them, one of them in wind: no cloth gets what is another's."""
     path = tmp_path / "sheet.obj"
     vertices = [(0.1 * i, 0.1 * j, 0.0) for j in range(4) for i in range(4)]
@@ -96,10 +77,11 @@ def test_several_cloths_of_both_kinds_fall_alike(monkeypatch, tmp_path):
         cloth("mesh", shape={"type": "mesh", "file": str(path), "up": "z"}, position=(1.0, 0.0, 0.0)),
         cloth("last", shape=rectangle((0.3, 0.2), (21, 6)), position=(0.0, 1.0, 0.0), stretch_stiffness=50.0),
     )
-    rows, lists = solver_of(*cloths), by_lists(monkeypatch, *cloths)
-    starts = rows.state.positions()
-    for solver in (rows, lists):
-        advance(solver, 0.1)
-    fallen = np.abs(lists.state.positions() - starts).max()
+    solver, expected = solver_of(*cloths), solver_of(*cloths)
+    starts = solver.state.positions()
+    advance(solver, 0.1)
+    with threads_in_float64():
+        advance(expected, 0.1)
+    fallen = np.abs(expected.state.positions() - starts).max()
     assert fallen > 0.03
-    assert np.abs(rows.state.positions() - lists.state.positions()).max() < 1e-4 * fallen
+    assert np.abs(solver.state.positions() - expected.state.positions()).max() < 1e-4 * fallen
