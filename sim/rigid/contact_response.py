@@ -13,12 +13,13 @@ from sim.rigid.contact_solver import (
     NO_IMPULSES,
     NO_LINKS,
     RELATIVE_TOLERANCE,
+    Apart,
     ContactSystem,
     Solution,
     solve_velocities,
 )
 from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
-from sim.rigid.joint_system import UNBOUNDED, JointDemand, solve_alone
+from sim.rigid.joint_system import JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
@@ -107,7 +108,6 @@ class ContactResponse:
         impacts, bounces = self._bounce(
             contacts, bodies, system, before, friction, restitution, least_normal, dt, of_impacts
         )
-        most = system.most_sweeps(before)
         solution = solve_velocities(
             system,
             impacts.velocity,
@@ -117,24 +117,24 @@ class ContactResponse:
             relative_tolerance=RELATIVE_TOLERANCE,
             tolerance=self._tolerance(dt),
             joints=of_step,
-            most=most,
+            most=system.most_sweeps(before),
+            apart=_separation(contacts, bounces, dt),
         )
         bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3], solution.velocity[:n, 3:]
         self._replace(contacts.keys, solution.impulses / dt, is_active)
 
-        separation = self._separate(contacts, system, bounces, solution.along_normals, dt, most)
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
         pushed = solution.impulses.any(axis=1) | impacts.impulses.any(axis=1)
         for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
             touched[np.minimum(body[pushed], n)] = True
             held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
         return Outcome(
-            separation.velocity[:n, :3],
-            separation.velocity[:n, 3:],
+            solution.extra[:n, :3],
+            solution.extra[:n, 3:],
             touched[:n],
             held[:n],
-            impacts.iterations + solution.iterations + separation.iterations,
-            impacts.converged and solution.converged and separation.converged,
+            impacts.iterations + solution.iterations,
+            impacts.converged and solution.converged,
             by_joints + impacts.joint_impulses + solution.joint_impulses,
         )
 
@@ -161,7 +161,7 @@ class ContactResponse:
         impulses, bounces = np.zeros((k, 3)), Bounces.none(k)
         by_joints = NO_IMPULSES if joints is None else np.zeros(len(joints.bias))
         if not restitution.any():
-            return Solution(impulses, velocity, np.zeros(k), 0, True, by_joints), bounces
+            return Solution(impulses, velocity, np.zeros_like(velocity), 0, True, by_joints), bounces
         iterations, converged = 0, True
         for rounds in range(MOST_ROUNDS + 1):
             found = Bounces.find(
@@ -195,7 +195,7 @@ class ContactResponse:
             impulses[rows] += solution.impulses
             velocity = solution.velocity
             iterations, converged = iterations + solution.iterations, converged and solution.converged
-        return Solution(impulses, velocity, np.zeros(k), iterations, converged, by_joints), bounces
+        return Solution(impulses, velocity, np.zeros_like(velocity), iterations, converged, by_joints), bounces
 
     def _tolerance(self, dt: float) -> float:
         """What a sweep may still change besides when it is the last [m/s]."""
@@ -231,34 +231,8 @@ class ContactResponse:
         rows, is_known = rows_of(contacts.keys, self.last_keys)
         return np.where(is_known[:, None], dt * self._forces[rows], 0.0)
 
-    def _separate(
-        self,
-        contacts: Contacts,
-        system: ContactSystem,
-        bounces: Bounces,
-        normal_velocity: Array,
-        dt: float,
-        most: NDArray[np.int32],
-    ) -> Solution:
-        """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
-        k, overlap, rest = len(contacts), -contacts.gap - SLOP, np.zeros((len(system.ease), 6))
-        if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
-            return Solution(np.zeros((k, 3)), rest, np.zeros(k), 0, True, NO_IMPULSES)
-        rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
-        # Contacts that do not overlap may close by what the velocities leave of their gaps.
-        wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
-        wanted = np.where(overlap > 0.0, wanted, np.minimum(wanted, 0.0))
-        wanted = np.where(
-            bounces.is_placed, bounces.displacement(normal_velocity, contacts.gap) / dt - normal_velocity, wanted
-        )
-        return solve_velocities(
-            system,
-            rest,
-            least_normal=wanted,
-            friction=np.zeros(k),
-            start=np.zeros((k, 3)),
-            relative_tolerance=WEIGHT_TOLERANCE,
-            tolerance=0.0,
-            lowest=np.where(bounces.is_placed, -UNBOUNDED, 0.0),
-            most=most,
-        )
+
+def _separation(contacts: Contacts, bounces: Bounces, dt: float) -> Apart:
+    """Overlaps shrink, and bounces end where they would have come to."""
+    rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
+    return Apart(contacts.gap, rate, SLOP, dt, bounces.is_placed, bounces.rest, bounces.fall, WEIGHT_TOLERANCE)
