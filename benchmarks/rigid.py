@@ -119,9 +119,8 @@ def described(solver: RigidSolver) -> dict[str, float]:
 
     count = len(solver.all_geometries)
     moves = np.arange(count) < len(solver.bodies)
-    detector = CollisionDetector(solver.all_geometries, solver.walls)
-    nothing = np.zeros(0, dtype=np.int64)
-    found = detector.find(solver.poses(), np.zeros(count + 1), nothing, moves)
+    detector = CollisionDetector(solver.all_geometries, solver.walls, len(solver.bodies))
+    found = detector.find(solver.poses(), np.zeros(count + 1), moves)
     depth = np.maximum(-found.gap, 0.0)
     speed = np.sqrt(np.square(solver.bodies.velocity).sum(axis=1))
     return {

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.core.solver import Arrays
 from sim.rigid.contact_solver import (
     NO_IMPULSES,
     NO_LINKS,
@@ -18,7 +17,7 @@ from sim.rigid.contact_solver import (
     Solution,
     solve_velocities,
 )
-from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
+from sim.rigid.contacts import Array, Contacts, Indices
 from sim.rigid.joint_system import JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
 from sim.rigid.restitution import Bounces, solve_impacts
@@ -54,21 +53,17 @@ class Outcome:
     extra_angular_velocity: Array  # [rad/s], (n, 3)
     is_touched: NDArray[np.bool_]  # bodies that got an impulse, (n,) bool
     is_held: NDArray[np.bool_]  # bodies that got one from what cannot move, (n,) bool
+    forces: Array  # at the contacts, from which the next step starts [N], (k, 3)
     iterations: int  # sweeps of the solver
     converged: bool  # whether it converged
     joint_impulses: Array  # of the joints, (r,), if there are any
 
 
 class ContactResponse:
-    """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
-
-    Attributes:
-        last_keys: the contacts of the last step, ascending.
-    """
+    """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s²."""
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
         self._surfaces, self._gravity = surfaces, gravity
-        self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
     def resolve(
         self,
@@ -82,17 +77,16 @@ class ContactResponse:
     ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
-        These are all their contacts; what is known of those of other bodies stays. Inverse inertia tensors are in world
+        These are all their contacts. Inverse inertia tensors are in world
         axes, (n, 3, 3); joints, with their step, hold where contacts are.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
         n = len(bodies)
         if not len(contacts):
-            self._replace(contacts.keys, np.zeros((0, 3)), is_active)
             nobody = np.zeros(n, dtype=bool)
             still = np.zeros(0 if step is None else len(step.values))
-            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), 0, True, still)
+            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), contacts.force, 0, True, still)
         inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
         links = NO_LINKS if step is None else step.system.links()
         system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links)
@@ -113,7 +107,7 @@ class ContactResponse:
             impacts.velocity,
             least_normal=least_normal,
             friction=friction,
-            start=self._starting_impulses(contacts, dt),
+            start=dt * contacts.force,
             relative_tolerance=RELATIVE_TOLERANCE,
             tolerance=self._tolerance(dt),
             joints=of_step,
@@ -121,7 +115,6 @@ class ContactResponse:
             apart=_separation(contacts, bounces, dt),
         )
         bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3], solution.velocity[:n, 3:]
-        self._replace(contacts.keys, solution.impulses / dt, is_active)
 
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
         pushed = solution.impulses.any(axis=1) | impacts.impulses.any(axis=1)
@@ -133,6 +126,7 @@ class ContactResponse:
             solution.extra[:n, 3:],
             touched[:n],
             held[:n],
+            solution.impulses / dt,
             impacts.iterations + solution.iterations,
             impacts.converged and solution.converged,
             by_joints + impacts.joint_impulses + solution.joint_impulses,
@@ -200,36 +194,6 @@ class ContactResponse:
     def _tolerance(self, dt: float) -> float:
         """What a sweep may still change besides when it is the last [m/s]."""
         return WEIGHT_TOLERANCE * dt * float(np.linalg.norm(self._gravity))
-
-    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """The forces that the next step starts from."""
-        return {"contact_keys": self.last_keys.copy(), "contact_forces": self._forces.copy()}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Continue from a checkpoint. Raises ValueError when an array is missing."""
-        for name in ("contact_keys", "contact_forces"):
-            if name not in arrays:
-                raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
-        keys, forces = np.asarray(arrays["contact_keys"]), np.asarray(arrays["contact_forces"])
-        self._keep(keys.astype(np.int64), forces.astype(np.float64).reshape(-1, 3))
-
-    def _replace(self, keys: Indices, forces: Array, is_active: NDArray[np.bool_]) -> None:
-        """Keep the forces of the contacts of active bodies, and those that were known of other bodies."""
-        first, second = bodies_of(self.last_keys)
-        among = np.append(is_active, False)
-        stays = ~(among[np.minimum(first, len(is_active))] | among[np.minimum(second, len(is_active))])
-        self._keep(np.concatenate([keys, self.last_keys[stays]]), np.concatenate([forces, self._forces[stays]]))
-
-    def _keep(self, keys: Indices, forces: Array) -> None:
-        order = np.argsort(keys)
-        self.last_keys, self._forces = keys[order], forces[order]
-
-    def _starting_impulses(self, contacts: Contacts, dt: float) -> Array:
-        """The forces at the same contacts in the last step times dt [s], (k, 3)."""
-        if not len(self.last_keys):
-            return np.zeros((len(contacts), 3))
-        rows, is_known = rows_of(contacts.keys, self.last_keys)
-        return np.where(is_known[:, None], dt * self._forces[rows], 0.0)
 
 
 def _separation(contacts: Contacts, bounces: Bounces, dt: float) -> Apart:

@@ -103,7 +103,7 @@ class RigidSolver:
         self.all_names = tuple(body.name for body in everybody)
         self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
-        self._detector = CollisionDetector(self.all_geometries, self.walls)
+        self._detector = CollisionDetector(self.all_geometries, self.walls, len(self.solids))
         self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
@@ -190,10 +190,11 @@ class RigidSolver:
         moves = is_active | ~bodies.is_dynamic
         reach = self._with_obstacles(np.where(moves, dt * self._surface_speeds(), 0.0))
         among = np.append(is_active, np.zeros(len(self._fixed_position) - 1, dtype=bool))
-        contacts = self._detector.find(self.poses(), reach, self._response.last_keys, among)
+        contacts = self._detector.find(self.poses(), reach, among)
         inverse_inertia, joints = bodies.inverse_inertia(), self.joints
         step = None if joints is None else joints.begin(bodies, dt, is_active, inverse_inertia)
         outcome = self._response.resolve(contacts, bodies, dt, is_active, inverse_inertia, joints, step)
+        self._detector.keep_forces(outcome.forces)
         self._contact_count = len(contacts)
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
@@ -425,7 +426,6 @@ class RigidSolver:
         return {
             **{name: getattr(self.bodies, name).copy() for name in _STATE},
             **self._detector.checkpoint(),
-            **self._response.checkpoint(),
             **({} if self.joints is None else self.joints.checkpoint()),
             "clock": np.array([self.time_s]),
         }
@@ -438,7 +438,6 @@ class RigidSolver:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}, got {found}")
         self._detector.restore(arrays)
-        self._response.restore(arrays)
         if self.joints is not None:
             self.joints.restore(arrays)
             self._obey_joints()

@@ -12,8 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
-from sim.rigid.broad_phase import NearBoxes
-from sim.rigid.collision import CONTACT_BAND, TRUSTED_MOTION, CollisionDetector
+from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Array, Indices
 from sim.rigid.states import MovingBodies
 from sim.shapes.body_geometry import BodyGeometry
@@ -58,7 +57,6 @@ class StepChooser:
         self._radius = np.array([geometry.radius for geometry in geometries])
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
-        self._boxes = NearBoxes()
         self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
         self.links = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
@@ -68,13 +66,10 @@ class StepChooser:
         acceleration = float(np.linalg.norm(self._gravity))
         spin = np.sqrt(np.square(bodies.angular_velocity).sum(axis=1))
         own = bodies.surface_speeds(self._radius[:n])
-        motion = np.zeros(len(self._edge))
+        motion = np.zeros(len(self._edge) + 1)
         motion[:n] = (own if speeds is None else speeds) * dt + 0.5 * acceleration * dt * dt
-        reach = (motion + (CONTACT_BAND + TRUSTED_MOTION) * self._edge)[:, None]
-        lower, upper = self._detector.boxes(poses)
         among = np.append(is_active, np.zeros(len(self._edge) - n, dtype=bool))
-        boxes = self._boxes.overlapping(lower - reach, upper + reach, motion, among)
-        first, second = self._detector.touching(*boxes)
+        first, second = self._detector.overlapping(poses, motion, among)
 
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
         turning = np.append(spin, np.zeros(len(self._edge) - n)) * self._radius
