@@ -469,3 +469,34 @@ def solve_jointed_islands(
             True, island, islands, system, joint_order, joint_first, joints,
             relative_tolerance, tolerance, tolerance_apart, overlaps, found,
         )  # fmt: skip
+
+
+@ti.func
+def join(one: ti.i32, two: ti.i32, group: Whole):
+    """Have two bodies be of one group: what belongs to a larger number belongs to the smaller one as well."""
+    larger, smaller = ti.max(one, two), ti.min(one, two)
+    while larger != smaller:
+        before = ti.atomic_min(group[larger], smaller)
+        if before == larger:
+            larger = smaller  # it was the first of its group
+        else:
+            larger, smaller = ti.max(before, smaller), ti.min(before, smaller)
+
+
+@kernel_of_host_arrays
+def join_bodies(bodies: Pairs, links: Pairs, moves: Whole, group: Whole):
+    """Groups of bodies that contacts, (c, 2), and links, (l, 2), hang together by way of bodies that move.
+
+    Args:
+        group: each body's own number, and then the least number of its group, whatever the order of the threads.
+    """
+    for contact in range(bodies.shape[0]):
+        if moves[bodies[contact, 0]] == 1 and moves[bodies[contact, 1]] == 1:
+            join(bodies[contact, 0], bodies[contact, 1], group)
+    for link in range(links.shape[0]):
+        join(links[link, 0], links[link, 1], group)
+    for body in range(group.shape[0]):
+        first = group[body]
+        while group[first] != first:
+            first = group[first]
+        group[body] = first

@@ -49,8 +49,7 @@ class Surfaces:
 class Outcome:
     """What the contacts of a step did besides changing velocities."""
 
-    extra_velocity: Array  # added to the velocity in this step's change of poses only [m/s], (n, 3)
-    extra_angular_velocity: Array  # [rad/s], (n, 3)
+    extra: Array  # (v, omega) added in this step's change of poses only [m/s], [rad/s], (n + 1, 6)
     is_touched: NDArray[np.bool_]  # bodies that got an impulse, (n,) bool
     is_held: NDArray[np.bool_]  # bodies that got one from what cannot move, (n,) bool
     forces: Array  # at the contacts, from which the next step starts [N], (k, 3)
@@ -70,15 +69,14 @@ class ContactResponse:
         contacts: Contacts,
         bodies: MovingBodies,
         dt: float,
-        is_active: NDArray[np.bool_],
-        inverse_inertia: Array,
+        ease: Array,
         joints: Joints | None = None,
         step: JointStep | None = None,
     ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
-        These are all their contacts. Inverse inertia tensors are in world
-        axes, (n, 3, 3); joints, with their step, hold where contacts are.
+        These are all their contacts. How easily impulses move bodies, and that others do not, is `ContactSystem.ease`;
+        joints, with their step, hold where contacts are.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
@@ -86,10 +84,9 @@ class ContactResponse:
         if not len(contacts):
             nobody = np.zeros(n, dtype=bool)
             still = np.zeros(0 if step is None else len(step.values))
-            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), contacts.force, 0, True, still)
-        inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
+            return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), contacts.force, 0, True, still)
         links = NO_LINKS if step is None else step.system.links()
-        system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links)
+        system = ContactSystem.build(contacts, bodies.position, ease, links)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
         before = np.zeros((n + 1, 6))
@@ -114,16 +111,19 @@ class ContactResponse:
             most=system.most_sweeps(before),
             apart=_separation(contacts, bounces, dt),
         )
-        bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3], solution.velocity[:n, 3:]
+        bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3].copy(), solution.velocity[:n, 3:].copy()
 
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
-        pushed = solution.impulses.any(axis=1) | impacts.impulses.any(axis=1)
-        for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
-            touched[np.minimum(body[pushed], n)] = True
-            held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
+        pushed = solution.impulses[:, 0] != 0.0
+        for axis in (1, 2):
+            pushed |= solution.impulses[:, axis] != 0.0
+        pushed |= impacts.impulses.any(axis=1)
+        is_free = np.append(bodies.is_free, False)[system.bodies]
+        for side in range(2):
+            touched[system.bodies[pushed, side]] = True
+            held[system.bodies[pushed & ~is_free[:, 1 - side], side]] = True
         return Outcome(
-            solution.extra[:n, :3],
-            solution.extra[:n, 3:],
+            solution.extra,
             touched[:n],
             held[:n],
             solution.impulses / dt,

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.rotation import cross
 from sim.rigid.contacts import Array, Contacts, Indices
@@ -41,14 +39,10 @@ class ContactSystem:
     links: Indices  # pairs of bodies that joints link, (l, 2)
 
     @classmethod
-    def build(
-        cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array, links: Indices = NO_LINKS
-    ) -> ContactSystem:
+    def build(cls, contacts: Contacts, position: Array, ease: Array, links: Indices = NO_LINKS) -> ContactSystem:
         """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
         n = len(position)
         bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n).astype(np.int32)
-        ease = np.zeros((n + 1, 7))
-        ease[:n, 0], ease[:n, 1:] = inverse_mass, inverse_inertia.reshape(n, 9)[:, [0, 1, 2, 4, 5, 8]]
         position = np.concatenate([position, np.zeros((1, 3))])
         islands = _islands(bodies, ease[:, 0] > 0.0, links)
         return cls(contacts.point, contacts.normal, bodies, position, ease, *islands, links)
@@ -70,7 +64,8 @@ class ContactSystem:
     def most_sweeps(self, velocity: Array) -> NDArray[np.int32]:
         """How many sweeps each island is worth, (islands,), with velocities (v, omega) of all bodies, (n + 1, 6)."""
         sizes = np.bincount(self.islands)
-        speed = np.sqrt(np.square(velocity[:, :3]).sum(axis=1))[self.bodies].max(axis=1)
+        speeds = np.sqrt(np.square(velocity[:, :3]).sum(axis=1))[self.bodies]
+        speed = np.maximum(speeds[:, 0], speeds[:, 1])
         is_coarse = np.bincount(self.islands, weights=speed) > COARSE_SPEED * sizes
         fewer = (COARSE_WORK // sizes).clip(FEWEST_ITERATIONS, MAX_ITERATIONS)
         return np.where(is_coarse, fewer, MAX_ITERATIONS).astype(np.int32)
@@ -208,21 +203,16 @@ def solve_velocities(
 
 def _islands(bodies: NDArray[np.int32], moves: NDArray[np.bool_], links: Indices) -> tuple[Indices, Indices]:
     """Numbers of the groups of contacts, (k,), and of bodies, (n + 1,), which impulses move, that joints link too."""
+    from sim.rigid.contact_kernels import join_bodies
+
     first, second = bodies.T
-    group = _groups(bodies, moves, links)
+    group = np.arange(len(moves), dtype=np.int32)
+    join_bodies(bodies, links.astype(np.int32), moves.astype(np.int32), group)
     of_contacts = group[np.where(moves[first], first, second)]
     number = np.full(len(moves), -1)
     number[of_contacts] = 0
     number[number == 0] = np.arange(np.count_nonzero(number == 0))
     return number[of_contacts], np.where(moves, number[group], -1)
-
-
-def _groups(bodies: NDArray[np.int32], moves: NDArray[np.bool_], links: Indices) -> Indices:
-    """Number of the group of each body, (n + 1,), that contacts and joints link."""
-    first, second = np.concatenate([bodies[moves[bodies].all(axis=1)], links]).T
-    shape = (len(moves), len(moves))
-    linked = coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape)
-    return connected_components(linked, directed=False)[1].astype(np.int64)
 
 
 def _joints_of_islands(system: ContactSystem, joints: JointDemand) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
