@@ -120,7 +120,8 @@ def described(solver: RigidSolver) -> dict[str, float]:
     count = len(solver.all_geometries)
     moves = np.arange(count) < len(solver.bodies)
     detector = CollisionDetector(solver.all_geometries, solver.walls, len(solver.bodies))
-    found = detector.find(solver.poses(), np.zeros(count + 1), moves)
+    detector.find(solver.poses(), np.zeros(count + 1), moves)
+    found = detector.contacts()
     depth = np.maximum(-found.gap, 0.0)
     speed = np.sqrt(np.square(solver.bodies.velocity).sum(axis=1))
     return {

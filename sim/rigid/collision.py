@@ -30,6 +30,7 @@ STEPS_AHEAD, ROOM = 5.0, 0.05
 """Near pairs are searched for with room for the motion of so many steps, and for a part of their shortest edges."""
 LARGEST_WORK = 1 << 25  # numbers that pairs need which a GPU looks at side by side
 MOST_BLOCKS = 1 << 14  # of these pairs
+HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio
 COLUMNS = {"pairs": 4, "features": 2, "planes": 6, "balls": 4, "forces": 3, "bodies": 2, "point": 3, "normal": 3}
 """Of arrays of pairs and of contacts."""
 
@@ -42,6 +43,7 @@ class CollisionDetector:
     (`collision_kernels.Kept`), all within that distance included.
 
     Attributes:
+        deepest: overlap that was found last [m].
         untouching: keys of pairs of bodies that do not touch each other, as joints hold them, ascending.
 
     Raises:
@@ -61,7 +63,7 @@ class CollisionDetector:
         self._pairs, self._outer = np.zeros((0, 4), dtype=np.int32), np.zeros((self._domain, 6))
         self._moved, self._must_search, self._is_renewed = np.zeros(self._domain + 1), True, False
         self._rows: Any = slice(0, 0)
-        self._total = 0
+        self._total, self.deepest, self._was_active = 0, 0.0, np.zeros(self._domain, dtype=bool)
         self._near = self._found = self._kept = self._spare = self._placed = self._scratch = None
 
     @property
@@ -71,7 +73,8 @@ class CollisionDetector:
 
     @untouching.setter
     def untouching(self, keys: Indices) -> None:
-        self._untouching, self._must_search = keys, True
+        if not np.array_equal(keys, self._untouching):
+            self._untouching, self._must_search = keys, True
 
     def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
         """Those of some pairs of bodies, the lower number first, that may touch, (p,) each."""
@@ -90,6 +93,8 @@ class CollisionDetector:
             "contact_starts": self._starts().copy(),
             **{
                 f"contact_{name}": copied(getattr(self._kept, name))[: self._total]
+                if self._total
+                else np.zeros((0, COLUMNS[name]))
                 for name in ("features", "planes", "balls", "forces")
             },
         }
@@ -112,24 +117,21 @@ class CollisionDetector:
             fill(getattr(self._kept, name), np.array(arrays[f"contact_{name}"]))
         fill(self._near.before, np.arange(len(pairs), dtype=np.int32))
 
-    def find(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> Contacts:
-        """The contacts of all active bodies in poses, by pair, in order of their numbers.
+    def find(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> None:
+        """Find the contacts of all active bodies in poses.
 
         The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the step
         before are preferred among equals. Contacts of bodies that are not active are kept.
         """
+        self.look(poses, motion)
         bodies, count = self._bodies, len(self._pairs)
-        put(bodies.pose, np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1))
-        put(bodies.motion, motion)
         put(bodies.moved, self._moved)
         put(bodies.is_active, np.append(is_active, False))
-        if kernels.place_boxes(bodies, self._domain, self._outer_on_device) > 0 or self._must_search:
-            self._search(poses, motion)
-            count = len(self._pairs)
         self._moved = np.zeros(self._domain + 1)
+        self._was_active, self._total, self.deepest = is_active, 0, 0.0
         if not count:
-            return self._none()
-        near, walls = self._near, self._wall_rows
+            return
+        near, walls = self._near, self.walls
         tasks = kernels.choose_pairs(count, bodies, near, walls)
         rows = tasks * kernels.MOST_KEPT
         self._found = larger_tables(kernels.Found, self._found, COLUMNS, rows, counts=tasks, clearances=tasks)
@@ -146,20 +148,61 @@ class CollisionDetector:
         self._total = kernels.count_contacts(count, bodies, near, self._found, self._kept, following)
         following = self._larger_kept(following, self._total)
         self._placed = larger_tables(kernels.Placed, self._placed, COLUMNS, self._total)
-        kernels.place_contacts(count, bodies, near, self._found, self._kept, following, self._placed)
+        found = kernels.place_contacts(count, bodies, near, self._found, self._kept, following, self._placed)
+        self.deepest = 1.0e-9 * found
         self._kept, self._spare = following, self._kept
         if self._is_renewed:
             fill(near.before, np.arange(count, dtype=np.int32))
             self._is_renewed = False
-        return self._contacts(is_active)
+
+    def look(self, poses: Poses, motion: Array) -> None:
+        """See to it that all pairs are known that may get near where surfaces may get so far [m], (n + 1,)."""
+        put(self._bodies.pose, np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1))
+        put(self._bodies.motion, motion)
+        if kernels.place_boxes(self._bodies, self._domain, self._outer_on_device) > 0 or self._must_search:
+            self._search(poses, motion)
+
+    def contacts(self) -> Contacts:
+        """Those found last of active bodies, by pair, in order of the numbers of bodies."""
+        self._rows = slice(0, self._total)
+        if not self._total:
+            nobody, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+            return Contacts(nobody, nobody, np.zeros((0, 2), dtype=np.int32), nothing, nothing, nothing[:, 0], nothing)
+        placed, kept = self._placed, self._kept
+        bodies: NDArray[np.int32] = viewed(placed.bodies)[self._rows]
+        if not self._was_active[: self._moving].all():
+            among = np.append(self._was_active, False)
+            self._rows = np.flatnonzero(among[bodies].any(axis=1))
+            bodies = bodies[self._rows]
+        features, point, normal, gap, force = (
+            viewed(each)[self._rows] for each in (kept.features, placed.point, placed.normal, placed.gap, kept.forces)
+        )
+        first, second = bodies.astype(np.int64).T
+        return Contacts(first, second, features, point, normal, gap, force)
+
+    def active_count(self) -> int:
+        """How many contacts were found last of active bodies."""
+        if not self._total or self._was_active[: self._moving].all():
+            return self._total
+        among = np.append(self._was_active, False)
+        return int(np.count_nonzero(among[viewed(self._placed.bodies)[: self._total]].any(axis=1)))
 
     def keep_forces(self, forces: Array) -> None:
-        """Note forces of the contacts just found [N], (k, 3), from which the next step starts."""
+        """Note forces of those that `contacts` gave last [N], (k, 3), from which the next step starts."""
         if self._total:
             everything: NDArray[np.float64] = viewed(self._kept.forces)
             everything[self._rows] = forces
             if runs_on_gpu():
                 put(self._kept.forces, everything)
+
+    @property
+    def pair_count(self) -> int:
+        """Of pairs that are near, or may get so soon."""
+        return len(self._pairs)
+
+    def on_device(self) -> tuple[Any, Any, Any, Any]:
+        """What was found last: bundles of `collision_kernels.Near`, `Kept`, `Bodies` and `Placed`."""
+        return self._near, self._kept, self._bodies, self._placed
 
     def follow(self, motion: Array) -> None:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
@@ -179,11 +222,10 @@ class CollisionDetector:
 
         One at least is active. Surfaces get so far in the step [m], (n + 1,).
         """
+        self.look(poses, motion)
         lower, upper = self.boxes(poses)
         reach = ((kernels.CONTACT_BAND + kernels.TRUSTED_MOTION) * self._size[:-1] + motion[:-1])[:, None]
         lower, upper = lower - reach, upper + reach
-        if self._must_search or np.any(lower < self._outer[:, :3]) or np.any(upper > self._outer[:, 3:]):
-            self._search(poses, motion)
         first, second = self._between
         found = is_active[first] | is_active[second]
         for axis in range(3):
@@ -238,36 +280,22 @@ class CollisionDetector:
         fill(self._near.pairs, pairs)
         fill(self._near.before, before.astype(np.int32))
         fill(self._near.budget, budgets)
+        # Of Knuth's multiplicative hash.
+        rank = np.empty(count, dtype=np.int32)
+        rank[np.argsort(_keys_of(pairs).astype(np.uint64) * HASH)] = np.arange(count)
+        fill(self._near.rank, rank)
         self._is_renewed = True
 
-    def _contacts(self, is_active: NDArray[np.bool_]) -> Contacts:
-        """Those of the last search that belong to active bodies."""
-        placed, kept, k = self._placed, self._kept, self._total
-        bodies: NDArray[np.int32] = viewed(placed.bodies)[:k]
-        self._rows: Any = slice(0, k)
-        if not is_active[: self._moving].all():
-            among = np.append(is_active, False)
-            self._rows = np.flatnonzero(among[bodies].any(axis=1))
-            bodies = bodies[self._rows]
-        features, point, normal, gap, force = (
-            viewed(each)[self._rows] for each in (kept.features, placed.point, placed.normal, placed.gap, kept.forces)
-        )
-        first, second = bodies.astype(np.int64).T
-        return Contacts(first, second, features, point, normal, gap, force)
-
-    def _none(self) -> Contacts:
-        self._total, self._rows = 0, slice(0, 0)
-        nobody, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        return Contacts(nobody, nobody, np.zeros((0, 2), dtype=np.int32), nothing, nothing, nothing[:, 0], nothing)
-
     def _budgets(self) -> Array:
-        result: Array = copied(self._near.budget)[: len(self._pairs)]
-        return result
+        return copied(self._near.budget)[: len(self._pairs)] if len(self._pairs) else np.zeros(0)
 
     def _starts(self) -> NDArray[np.int32]:
         """Where contacts of each of the pairs begin, and the end, (p + 1,)."""
+        # Where pairs were searched for since contacts were, these are of the pairs before.
+        if not self._total or self._is_renewed:
+            return np.zeros(len(self._pairs) + 1, dtype=np.int32)
         starts: NDArray[np.int32] = viewed(self._kept.starts)[: len(self._pairs) + 1]
-        return starts if len(self._pairs) else np.zeros(1, dtype=np.int32)
+        return starts
 
     # --- arrays on the device ---
 
@@ -294,7 +322,8 @@ class CollisionDetector:
         return kept(self._outer)
 
     @cached_property
-    def _wall_rows(self) -> ti.Ndarray:
+    def walls(self) -> ti.Ndarray:
+        """What kernels read of walls, see `collision_kernels.find_contacts`."""
         rows = [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls]
         return kept(np.array(rows or [[0.0] * 7]))
 

@@ -80,6 +80,7 @@ class Near(NamedTuple):
     tasks: Whole  # the examined pairs, (p,)
     numbers: Whole  # room for what is added up, (p,)
     sums: Whole  # likewise
+    rank: Whole  # places in an order by chance, which is always the same for the same bodies, (p,)
 
 
 @bundle
@@ -609,14 +610,18 @@ def count_contacts(count: ti.i32, bodies: Bodies, near: Near, found: Found, befo
 
 
 @kernel
-def place_contacts(count: ti.i32, bodies: Bodies, near: Near, found: Found, before: Kept, kept: Kept, placed: Placed):
+def place_contacts(
+    count: ti.i32, bodies: Bodies, near: Near, found: Found, before: Kept, kept: Kept, placed: Placed
+) -> ti.i64:
     """Put the contacts of so many pairs in their places, with their forces if they were there, and find where they are.
 
-    Only what `kept` has of `starts` is read, the rest is written, as `placed` is.
+    Only what `kept` has of `starts` is read, the rest is written, as `placed` is. Returns the deepest overlap [nm].
     """
+    deepest = ti.cast(0, ti.i64)
     for pair in range(count):
         first, second, old = near.pairs[pair, 0], near.pairs[pair, 1], near.before[pair]
         is_examined = near.action[pair] == EXAMINED
+        depth = ti.cast(0.0, ti.f64)
         for row in range(kept.starts[pair], kept.starts[pair + 1]):
             number = row - kept.starts[pair]
             if is_examined:
@@ -648,10 +653,16 @@ def place_contacts(count: ti.i32, bodies: Bodies, near: Near, found: Found, befo
             anchor = turned(bodies.pose, other, vector_at(kept.planes, row, 0)) + vector_at(bodies.pose, other, 0)
             centre = turned(bodies.pose, owner, vector_at(kept.balls, row, 0)) + vector_at(bodies.pose, owner, 0)
             placed.bodies[row, 0], placed.bodies[row, 1] = first, second
-            placed.gap[row] = outward.dot(centre - anchor) - kept.balls[row, 3]
+            gap = outward.dot(centre - anchor) - kept.balls[row, 3]
+            placed.gap[row] = gap
+            if bodies.is_active[first] == 1 or bodies.is_active[second] == 1:
+                depth = ti.max(depth, -gap)
             for axis in ti.static(range(3)):
                 placed.point[row, axis] = centre[axis] - kept.balls[row, 3] * outward[axis]
                 placed.normal[row, axis] = ti.select(side == 0, outward[axis], -outward[axis])
+        if depth > 0.0:
+            ti.atomic_max(deepest, ti.cast(ti.min(1.0e9 * depth, 1.0e18), ti.i64))
+    return deepest
 
 
 @kernel_of_host_arrays

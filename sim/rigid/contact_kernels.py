@@ -86,6 +86,12 @@ def vector_of(table: ti.template(), row: ti.i32, column: ti.i32) -> Vector3:
 
 
 @ti.func
+def row_of(rows: ti.template(), row: ti.i32) -> Vector3:
+    """Three numbers of a table of three columns."""
+    return Vector3(rows[row, 0], rows[row, 1], rows[row, 2])
+
+
+@ti.func
 def tensor_times(ease: ti.template(), torque: Vector3) -> Vector3:
     """Change of the angular velocity of a body of this ease by an angular impulse."""
     return Vector3(
@@ -122,39 +128,46 @@ def tangents_of(n: Vector3):
 
 
 @func
-def gather(at: ti.i32, i: ti.i32, system: System, impulses: Rows, work: Work):
-    """Put together what a contact is, its own block of A among it: nn, n1, n2, 11, 12, 22.
+def gather_contact(
+    at: ti.i32,
+    normal: Vector3,
+    arm_one: Vector3,
+    arm_two: Vector3,
+    start: Vector3,
+    friction: ti.f64,
+    least: ti.f64,
+    one: ti.i32,
+    two: ti.i32,
+    ease: Eases,
+    work: Work,
+):
+    """Put together what a contact of two bodies is, its own block of A among it: nn, n1, n2, 11, 12, 22.
 
-    Impulses to start from push, and stay within friction.
+    Impulses to start from, in world axes, push, and stay within friction.
     """
-    normal = Vector3(system.normal[i, 0], system.normal[i, 1], system.normal[i, 2])
-    one, two = tangents_of(normal)
-    start = Vector3(impulses[i, 0], impulses[i, 1], impulses[i, 2])
-    along = Vector3(ti.max(start.dot(normal), 0.0), start.dot(one), start.dot(two))
-    rubbing, limit = ti.sqrt(along[1] * along[1] + along[2] * along[2]), system.friction[i] * along[0]
+    first, second = tangents_of(normal)
+    along = Vector3(ti.max(start.dot(normal), 0.0), start.dot(first), start.dot(second))
+    rubbing, limit = ti.sqrt(along[1] * along[1] + along[2] * along[2]), friction * along[0]
     if rubbing > limit:
         along[1] *= limit / rubbing
         along[2] *= limit / rubbing
     for axis in ti.static(range(3)):
-        work[at][NORMAL + axis], work[at][TANGENT + axis], work[at][TANGENT + 3 + axis] = (
-            normal[axis],
-            one[axis],
-            two[axis],
-        )
+        work[at][NORMAL + axis], work[at][TANGENT + axis] = normal[axis], first[axis]
+        work[at][TANGENT + 3 + axis] = second[axis]
+        work[at][ARM + axis], work[at][ARM + 3 + axis] = arm_one[axis], arm_two[axis]
         work[at][IMPULSE + axis], work[at][CHANGE + axis], work[at][AHEAD + axis] = along[axis], 0.0, 0.0
-    work[at][LEAST], work[at][LOWEST], work[at][FRICTION] = system.least[i], 0.0, system.friction[i]
+    work[at][LEAST], work[at][LOWEST], work[at][FRICTION] = least, 0.0, friction
     block = ti.Vector.zero(ti.f64, 6)
     for side in ti.static(range(2)):
-        body = system.bodies[i, side]
-        for axis in ti.static(range(3)):
-            work[at][ARM + 3 * side + axis] = system.point[i, axis] - system.position[body, axis]
-        if system.ease[body][0] > 0.0:
-            arm = vector_of(work, at, ARM + 3 * side)
+        body = one if ti.static(side == 0) else two
+        if ease[body][0] > 0.0:
+            arm = arm_one if ti.static(side == 0) else arm_two
             for row in ti.static(range(3)):
-                axis = vector_of(work, at, NORMAL + 3 * row)
-                answer = system.ease[body][0] * axis + tensor_times(system.ease[body], arm.cross(axis)).cross(arm)
+                axis = normal if ti.static(row == 0) else (first if ti.static(row == 1) else second)
+                answer = ease[body][0] * axis + tensor_times(ease[body], arm.cross(axis)).cross(arm)
                 for column in ti.static(range(row, 3)):
-                    block[ti.static(entry_of(row, column))] += answer.dot(vector_of(work, at, NORMAL + 3 * column))
+                    other = normal if ti.static(column == 0) else (first if ti.static(column == 1) else second)
+                    block[ti.static(entry_of(row, column))] += answer.dot(other)
     for entry in ti.static(range(6)):
         work[at][OWN + entry] = block[entry]
 
@@ -204,6 +217,78 @@ def push(body: ti.i32, impulse: Vector3, at: ti.i32, arm: ti.i32, system: System
 
 
 @func
+def relax_pair(
+    rubs: ti.template(),
+    there: bool,
+    ratio: ti.f64,
+    start: ti.i32,
+    stop: ti.i32,
+    one: ti.i32,
+    two: ti.i32,
+    ease: Eases,
+    velocity: Velocities,
+    work: Work,
+):
+    """Change the impulses of all contacts of two bodies one after the other, from the last on where it is not there.
+
+    Before that each goes on along the direction before by a ratio; the velocities, (n,), have done so. Without what
+    rubs there are normal impulses alone.
+
+    Returns:
+        the largest change of a velocity at a contact, and the sum of the squares of the changes of impulses.
+    """
+    largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    ease_one, ease_two = ease[one], ease[two]
+    linear_one, angular_one = vector_of(velocity, one, 0), vector_of(velocity, one, 3)
+    linear_two, angular_two = vector_of(velocity, two, 0), vector_of(velocity, two, 3)
+    for place in range(start, stop):
+        at = ti.select(there, place, start + stop - 1 - place)
+        normal = vector_of(work, at, NORMAL)
+        arm_one, arm_two = vector_of(work, at, ARM), vector_of(work, at, ARM + 3)
+        own = linear_one + angular_one.cross(arm_one) - linear_two - angular_two.cross(arm_two)
+        ahead_n = ratio * work[at][AHEAD]
+        old_n = work[at][IMPULSE] + ahead_n
+        new_n = ti.max(old_n - (own.dot(normal) - work[at][LEAST]) / work[at][OWN], work[at][LOWEST])
+        d_n = new_n - old_n
+        work[at][AHEAD], work[at][CHANGE], work[at][IMPULSE] = ahead_n + work[at][CHANGE], d_n, new_n
+        added = d_n * normal
+        largest = ti.max(largest, work[at][OWN] * ti.abs(d_n))
+        square += d_n * d_n
+        if ti.static(rubs):
+            ahead_1, ahead_2 = ratio * work[at][AHEAD + 1], ratio * work[at][AHEAD + 2]
+            old_1, old_2 = work[at][IMPULSE + 1] + ahead_1, work[at][IMPULSE + 2] + ahead_2
+            d_1, d_2 = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+            if work[at][FRICTION] > 0.0 and (new_n != 0.0 or old_1 != 0.0 or old_2 != 0.0):
+                # Slip without the tangential impulses of this contact.
+                a_11, a_12, a_22 = work[at][OWN + 3], work[at][OWN + 4], work[at][OWN + 5]
+                one_way, other_way = vector_of(work, at, TANGENT), vector_of(work, at, TANGENT + 3)
+                c_1 = own.dot(one_way) + work[at][OWN + 1] * d_n - a_11 * old_1 - a_12 * old_2
+                c_2 = own.dot(other_way) + work[at][OWN + 2] * d_n - a_12 * old_1 - a_22 * old_2
+                new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, work[at][FRICTION] * new_n)
+                d_1, d_2 = new_1 - old_1, new_2 - old_2
+                largest = ti.max(largest, a_11 * ti.abs(d_1), a_22 * ti.abs(d_2))
+                square += d_1 * d_1 + d_2 * d_2
+                added += d_1 * one_way + d_2 * other_way
+            work[at][AHEAD + 1], work[at][AHEAD + 2] = (
+                ahead_1 + work[at][CHANGE + 1],
+                ahead_2 + work[at][CHANGE + 2],
+            )
+            work[at][CHANGE + 1], work[at][CHANGE + 2] = d_1, d_2
+            work[at][IMPULSE + 1], work[at][IMPULSE + 2] = old_1 + d_1, old_2 + d_2
+        linear_one += ease_one[0] * added
+        angular_one += tensor_times(ease_one, arm_one.cross(added))
+        linear_two -= ease_two[0] * added
+        angular_two -= tensor_times(ease_two, arm_two.cross(added))
+    if ease_one[0] > 0.0:
+        for axis in ti.static(range(3)):
+            velocity[one][axis], velocity[one][3 + axis] = linear_one[axis], angular_one[axis]
+    if ease_two[0] > 0.0:
+        for axis in ti.static(range(3)):
+            velocity[two][axis], velocity[two][3 + axis] = linear_two[axis], angular_two[axis]
+    return largest, square
+
+
+@func
 def sweep(
     rubs: ti.template(),
     there: bool,
@@ -214,68 +299,17 @@ def sweep(
     velocity: Velocities,
     work: Work,
 ):
-    """Change the impulses of all contacts of an island one after the other, those of a pair together.
-
-    Before that each goes on along the direction before by a ratio; the velocities, (n,), have done so. Without what
-    rubs there are normal impulses alone.
-
-    Returns:
-        the largest change of a velocity at a contact, and the sum of the squares of the changes of impulses.
-    """
+    """Change the impulses of all contacts of an island, pair after pair, as `relax_pair` does."""
     largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     begin, end = islands.first[island], islands.first[island + 1]
     for step in range(begin, end):
         pair = ti.select(there, step, begin + end - 1 - step)
         start, stop = islands.spans[pair], islands.spans[pair + 1]
-        contact = islands.order[start]
-        one, two = system.bodies[contact, 0], system.bodies[contact, 1]
-        ease_one, ease_two = system.ease[one], system.ease[two]
-        linear_one, angular_one = vector_of(velocity, one, 0), vector_of(velocity, one, 3)
-        linear_two, angular_two = vector_of(velocity, two, 0), vector_of(velocity, two, 3)
-        for place in range(start, stop):
-            at = ti.select(there, place, start + stop - 1 - place)
-            normal = vector_of(work, at, NORMAL)
-            arm_one, arm_two = vector_of(work, at, ARM), vector_of(work, at, ARM + 3)
-            own = linear_one + angular_one.cross(arm_one) - linear_two - angular_two.cross(arm_two)
-            ahead_n = ratio * work[at][AHEAD]
-            old_n = work[at][IMPULSE] + ahead_n
-            new_n = ti.max(old_n - (own.dot(normal) - work[at][LEAST]) / work[at][OWN], work[at][LOWEST])
-            d_n = new_n - old_n
-            work[at][AHEAD], work[at][CHANGE], work[at][IMPULSE] = ahead_n + work[at][CHANGE], d_n, new_n
-            added = d_n * normal
-            largest = ti.max(largest, work[at][OWN] * ti.abs(d_n))
-            square += d_n * d_n
-            if ti.static(rubs):
-                ahead_1, ahead_2 = ratio * work[at][AHEAD + 1], ratio * work[at][AHEAD + 2]
-                old_1, old_2 = work[at][IMPULSE + 1] + ahead_1, work[at][IMPULSE + 2] + ahead_2
-                d_1, d_2 = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-                if work[at][FRICTION] > 0.0 and (new_n != 0.0 or old_1 != 0.0 or old_2 != 0.0):
-                    # Slip without the tangential impulses of this contact.
-                    a_11, a_12, a_22 = work[at][OWN + 3], work[at][OWN + 4], work[at][OWN + 5]
-                    one_way, other_way = vector_of(work, at, TANGENT), vector_of(work, at, TANGENT + 3)
-                    c_1 = own.dot(one_way) + work[at][OWN + 1] * d_n - a_11 * old_1 - a_12 * old_2
-                    c_2 = own.dot(other_way) + work[at][OWN + 2] * d_n - a_12 * old_1 - a_22 * old_2
-                    new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, work[at][FRICTION] * new_n)
-                    d_1, d_2 = new_1 - old_1, new_2 - old_2
-                    largest = ti.max(largest, a_11 * ti.abs(d_1), a_22 * ti.abs(d_2))
-                    square += d_1 * d_1 + d_2 * d_2
-                    added += d_1 * one_way + d_2 * other_way
-                work[at][AHEAD + 1], work[at][AHEAD + 2] = (
-                    ahead_1 + work[at][CHANGE + 1],
-                    ahead_2 + work[at][CHANGE + 2],
-                )
-                work[at][CHANGE + 1], work[at][CHANGE + 2] = d_1, d_2
-                work[at][IMPULSE + 1], work[at][IMPULSE + 2] = old_1 + d_1, old_2 + d_2
-            linear_one += ease_one[0] * added
-            angular_one += tensor_times(ease_one, arm_one.cross(added))
-            linear_two -= ease_two[0] * added
-            angular_two -= tensor_times(ease_two, arm_two.cross(added))
-        if ease_one[0] > 0.0:
-            for axis in ti.static(range(3)):
-                velocity[one][axis], velocity[one][3 + axis] = linear_one[axis], angular_one[axis]
-        if ease_two[0] > 0.0:
-            for axis in ti.static(range(3)):
-                velocity[two][axis], velocity[two][3 + axis] = linear_two[axis], angular_two[axis]
+        one, two = system.bodies[islands.order[start], 0], system.bodies[islands.order[start], 1]
+        of_velocity, of_impulses = relax_pair(
+            rubs, there, ratio, start, stop, one, two, system.ease, velocity, work
+        )  # fmt: skip
+        largest, square = ti.max(largest, of_velocity), square + of_impulses
     return largest, square
 
 
@@ -337,20 +371,29 @@ def relax_contacts(
     return ti.select(is_settled, taken, most + 1)
 
 
-@func
-def wanted_apart(i: ti.i32, along_normal: ti.f64, overlaps: Overlaps):
+@ti.func
+def wanted_apart(
+    gap: ti.f64,
+    along_normal: ti.f64,
+    rate: ti.f64,
+    slop: ti.f64,
+    dt: ti.f64,
+    is_placed: bool,
+    rest: ti.f64,
+    fall: ti.f64,
+):
     """Velocity along the normal that moves a contact apart, or which it may have beside what others do [m/s].
 
     Overlaps shrink; bounces end where they would have come to; others may close by what velocities leave of their gaps.
+    Arguments are those of `Overlaps`. Returns whether it moves something, too.
     """
-    depth, gap = -overlaps.gap[i] - overlaps.slop, ti.max(overlaps.gap[i], 0.0)
-    wanted = overlaps.rate * depth
-    if overlaps.is_placed[i] == 1:
-        way = overlaps.rest[i] * (along_normal - 0.5 * overlaps.fall[i]) - gap
-        wanted = way / overlaps.dt - along_normal
+    depth, room = -gap - slop, ti.max(gap, 0.0)
+    wanted = rate * depth
+    if is_placed:
+        wanted = (rest * (along_normal - 0.5 * fall) - room) / dt - along_normal
     elif depth <= 0.0:
-        wanted = ti.min(-gap / overlaps.dt - along_normal, 0.0)
-    return wanted, overlaps.is_placed[i] == 1 or depth > 0.0
+        wanted = ti.min(-room / dt - along_normal, 0.0)
+    return wanted, is_placed or depth > 0.0
 
 
 @func
@@ -374,8 +417,22 @@ def solve_island(
     for pair in range(islands.first[island], islands.first[island + 1]):
         for at in range(islands.spans[pair], islands.spans[pair + 1]):
             contact = islands.order[at]
-            gather(at, contact, system, found.impulses, found.work)
-            free = velocity_at(at, system.bodies[contact, 0], system.bodies[contact, 1], found.work, found.velocity)
+            one, two = system.bodies[contact, 0], system.bodies[contact, 1]
+            point = row_of(system.point, contact)
+            gather_contact(
+                at,
+                row_of(system.normal, contact),
+                point - row_of(system.position, one),
+                point - row_of(system.position, two),
+                row_of(found.impulses, contact),
+                system.friction[contact],
+                system.least[contact],
+                one,
+                two,
+                system.ease,
+                found.work,
+            )
+            free = velocity_at(at, one, two, found.work, found.velocity)
             may_change = ti.max(may_change, ti.abs(free).max(), ti.abs(system.least[contact]))
     may_change = tolerance + relative_tolerance * may_change
     for at in range(begin, end):
@@ -403,11 +460,15 @@ def solve_island(
         for axis in ti.static(range(3)):
             found.impulses[contact, axis] = impulse[axis]
         found.along_normal[contact] = along_normal
-        wanted, asks = wanted_apart(contact, along_normal, overlaps)
+        is_placed = overlaps.is_placed[contact] == 1
+        wanted, asks = wanted_apart(
+            overlaps.gap[contact], along_normal, overlaps.rate, overlaps.slop, overlaps.dt,
+            is_placed, overlaps.rest[contact], overlaps.fall[contact],
+        )  # fmt: skip
         moves_apart = moves_apart or asks
         may_change = ti.max(may_change, tolerance_apart * ti.abs(wanted))
         found.work[at][LEAST] = wanted
-        found.work[at][LOWEST] = ti.select(overlaps.is_placed[contact] == 1, -ti.cast(UNBOUNDED, ti.f64), 0.0)
+        found.work[at][LOWEST] = ti.select(is_placed, -ti.cast(UNBOUNDED, ti.f64), 0.0)
         found.work[at][IMPULSE], found.work[at][CHANGE], found.work[at][AHEAD] = 0.0, 0.0, 0.0
     if moves_apart and overlaps.rate > 0.0:
         found.sweeps[island, 1] = relax_contacts(

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.reductions import runs_on_gpu
+from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import (
+    COARSE_SPEED,
+    COARSE_WORK,
+    FEWEST_ITERATIONS,
+    MAX_ITERATIONS,
     NO_IMPULSES,
     NO_LINKS,
     RELATIVE_TOLERANCE,
@@ -20,6 +26,7 @@ from sim.rigid.contact_solver import (
 from sim.rigid.contacts import Array, Contacts, Indices
 from sim.rigid.joint_system import JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
+from sim.rigid.pile import Pile
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
@@ -52,21 +59,28 @@ class Outcome:
     extra: Array  # (v, omega) added in this step's change of poses only [m/s], [rad/s], (n + 1, 6)
     is_touched: NDArray[np.bool_]  # bodies that got an impulse, (n,) bool
     is_held: NDArray[np.bool_]  # bodies that got one from what cannot move, (n,) bool
-    forces: Array  # at the contacts, from which the next step starts [N], (k, 3)
+    forces: Array | None  # at the contacts, from which the next step starts [N], (k, 3), where they are not kept yet
     iterations: int  # sweeps of the solver
     converged: bool  # whether it converged
     joint_impulses: Array  # of the joints, (r,), if there are any
 
 
 class ContactResponse:
-    """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s²."""
+    """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
+
+    Attributes:
+        in_colours: whether contacts that neither bounce nor have joints beside them are solved by a `Pile`, many side
+            by side: on GPUs, where islands would be solved by a thread each.
+    """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
         self._surfaces, self._gravity = surfaces, gravity
+        self.in_colours: bool | None = None
+        self._pile: Pile | None = None
 
     def resolve(
         self,
-        contacts: Contacts,
+        detector: CollisionDetector,
         bodies: MovingBodies,
         dt: float,
         ease: Array,
@@ -75,16 +89,21 @@ class ContactResponse:
     ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
-        These are all their contacts. How easily impulses move bodies, and that others do not, is `ContactSystem.ease`;
-        joints, with their step, hold where contacts are.
+        A detector has found their contacts. How easily impulses move bodies, and that others do not, is
+        `ContactSystem.ease`; joints, with their step, hold where contacts are.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
         n = len(bodies)
-        if not len(contacts):
+        if not detector.active_count():
             nobody = np.zeros(n, dtype=bool)
             still = np.zeros(0 if step is None else len(step.values))
-            return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), contacts.force, 0, True, still)
+            return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still)
+        if self.in_colours is None:
+            self.in_colours = runs_on_gpu()
+        if self.in_colours and step is None and not self._surfaces.restitution.any():
+            return self._resolve_pile(detector, bodies, dt, ease)
+        contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
         system = ContactSystem.build(contacts, bodies.position, ease, links)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
@@ -131,6 +150,30 @@ class ContactResponse:
             impacts.converged and solution.converged,
             by_joints + impacts.joint_impulses + solution.joint_impulses,
         )
+
+    def _resolve_pile(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Outcome:
+        from sim.rigid.pile_kernels import Limits
+
+        self._pile = self._pile or Pile(detector, len(bodies))
+        n = len(bodies)
+        velocity = np.zeros((n + 1, 6))
+        velocity[:n, :3], velocity[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        limits = Limits(
+            RELATIVE_TOLERANCE,
+            self._tolerance(dt),
+            WEIGHT_TOLERANCE,
+            MAX_ITERATIONS,
+            COARSE_SPEED,
+            COARSE_WORK,
+            FEWEST_ITERATIONS,
+            _rate(dt),
+            SLOP,
+            dt,
+        )
+        velocity, extra = self._pile.solve(ease, velocity, self._surfaces.friction, limits)
+        bodies.velocity, bodies.angular_velocity = velocity[:n, :3].copy(), velocity[:n, 3:].copy()
+        touched = self._pile.touched[:n]
+        return Outcome(extra, touched > 0, touched > 1, None, self._pile.sweeps, self._pile.converged, NO_IMPULSES)
 
     def _bounce(
         self,
@@ -198,5 +241,9 @@ class ContactResponse:
 
 def _separation(contacts: Contacts, bounces: Bounces, dt: float) -> Apart:
     """Overlaps shrink, and bounces end where they would have come to."""
-    rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
-    return Apart(contacts.gap, rate, SLOP, dt, bounces.is_placed, bounces.rest, bounces.fall, WEIGHT_TOLERANCE)
+    return Apart(contacts.gap, _rate(dt), SLOP, dt, bounces.is_placed, bounces.rest, bounces.fall, WEIGHT_TOLERANCE)
+
+
+def _rate(dt: float) -> float:
+    """At which overlaps shrink [1/s]."""
+    return min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt

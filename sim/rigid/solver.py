@@ -199,14 +199,15 @@ class RigidSolver:
         ease = np.zeros((len(bodies) + 1, 7))
         bodies.describe(is_active, self._pose, ease)
         joints = self.joints
-        contacts = self._detector.find(self._poses_described(), reach, among)
+        self._detector.find(self._poses_described(), reach, among)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
-        outcome = self._response.resolve(contacts, bodies, dt, ease, joints, step)
-        self._detector.keep_forces(outcome.forces)
-        self._contact_count = len(contacts)
+        outcome = self._response.resolve(self._detector, bodies, dt, ease, joints, step)
+        if outcome.forces is not None:
+            self._detector.keep_forces(outcome.forces)
+        self._contact_count = self._detector.active_count()
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
-        self._max_penetration = max(self._max_penetration, -float(np.min(contacts.gap, initial=0.0)))
+        self._max_penetration = max(self._max_penetration, self._detector.deepest)
 
         is_touched = outcome.is_touched | (bodies.is_pushed & is_active)
         hold = None

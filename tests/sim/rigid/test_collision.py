@@ -24,7 +24,8 @@ def contacts_of(solver: RigidSolver, within: float, *, after: RigidSolver | None
     if after is not None:
         detector.find(after.poses(), np.full(count + 1, within), moves)
         detector.follow(np.full(count + 1, 1.0))
-    return detector.find(solver.poses(), np.full(count + 1, within), moves)
+    detector.find(solver.poses(), np.full(count + 1, within), moves)
+    return detector.contacts()
 
 
 @pytest.mark.parametrize(
