@@ -199,7 +199,11 @@ def friction_impulse(a_11: ti.f64, a_12: ti.f64, a_22: ti.f64, c_1: ti.f64, c_2:
                 break
             # -x·dx/dκ = x·(A + κ)⁻¹x
             fall = (d_22 * x_1 * x_1 - 2.0 * a_12 * x_1 * x_2 + d_11 * x_2 * x_2) / determinant
-            kappa += (ti.sqrt(square) / limit - 1.0) * square / fall
+            before, kappa = kappa, kappa + (ti.sqrt(square) / limit - 1.0) * square / fall
+            if before == 0.0:
+                # From below as well: |x| is at least |c| over κ and the larger eigenvalue of A.
+                spread = ti.sqrt(0.25 * (a_11 - a_22) * (a_11 - a_22) + a_12 * a_12)
+                kappa = ti.max(kappa, ti.sqrt(c_1 * c_1 + c_2 * c_2) / limit - 0.5 * (a_11 + a_22) - spread)
         if not is_found:
             scale = limit / ti.sqrt(square)
             x_1, x_2 = scale * x_1, scale * x_2
