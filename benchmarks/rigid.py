@@ -1,6 +1,6 @@
 """Speed of rigid bodies that fall into a pit or a bowl; JSON on the standard output.
 
-    python -m benchmarks.rigid --bodies 30 200 1000 [--hulls] [--frames 90] [--blender]
+    python -m benchmarks.rigid --bodies 30 200 1000 [--hulls] [--frames 90] [--blender] [--fast]
 
 Boxes of 10 cm, each turned in its own way, fall in layers onto each other between four walls; with `--hulls` meshes of
 convex stones of that size fall into a bowl instead. Times are of whole frames at 60 frames a second; of the frames the
@@ -35,6 +35,7 @@ EDGE, PITCH = 0.1, 0.18
 FRAMES_PER_SECOND = 60.0
 DENSITY, FRICTION = 500.0, 0.5
 WALL = 0.5  # thickness of Blender's walls [m]
+FAST = 60.0  # [m/s]
 
 
 def places(count: int, along: int, pitch: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -101,6 +102,46 @@ def measure(parameters: SceneParameters, frames: int) -> dict[str, Any]:
     return {**frame_times(times), "contacts": solver.diagnostics()["contacts"], "result": described(solver)}
 
 
+def with_fast_ball(parameters: SceneParameters) -> SceneParameters:
+    """The same scene, made wider, with a ball in the room beside it that flies to and fro."""
+    low, high = np.array(parameters.domain.min), np.array(parameters.domain.max)
+    ball = {
+        "name": "fast",
+        "kind": "dynamic",
+        "density": DENSITY,
+        "friction": 0.0,
+        "restitution": 1.0,
+        "shape": {"type": "sphere", "radius": 0.5 * EDGE},
+        "position": (high[0] + 5.0 * EDGE, 0.5 * (low[1] + high[1]), low[2] + EDGE),
+        "velocity": (0.0, FAST, 0.0),
+    }
+    divider = {
+        "name": "divider",
+        "friction": FRICTION,
+        "shape": {"type": "box", "size": (EDGE, *(2.0 * (high - low)[1:]))},
+        "position": (high[0] + 0.5 * EDGE, *(0.5 * (low + high)[1:])),
+    }
+    document = parameters.model_dump(exclude_unset=True)
+    document["rigid"] = [*document["rigid"], divider, ball]
+    document["domain"] = {**document["domain"], "max": (high[0] + 10.0 * EDGE, *high[1:])}
+    return SceneParameters.model_validate(document)
+
+
+def measure_fast(parameters: SceneParameters, frames: int) -> dict[str, Any]:
+    """Processor times of frames with a fast ball over those without."""
+    from sim.build import build_world
+
+    worlds = [
+        build_world(each, frames_per_second=FRAMES_PER_SECOND) for each in (parameters, with_fast_ball(parameters))
+    ]
+    times = np.array([[timed(world.advance_frame)[1] for world in worlds] for _ in range(frames)])[1:]
+    return {
+        "frame_processor_ms": spread(1e3 * times[:, 1]),
+        "median_over_without": float(np.median(times[:, 1] / times[:, 0])),
+        "sum_over_without": float(times[:, 1].sum() / times[:, 0].sum()),
+    }
+
+
 def frame_times(times: list[tuple[float, float]]) -> dict[str, Any]:
     """Wall and processor times of frames; the first, in which kernels are read, is told apart."""
     wall, processor = zip(*times, strict=True)
@@ -119,9 +160,9 @@ def described(solver: RigidSolver) -> dict[str, float]:
 
     count = len(solver.all_geometries)
     moves = np.arange(count) < len(solver.bodies)
-    detector = CollisionDetector(solver.all_geometries, solver.walls)
-    nothing = np.zeros(0, dtype=np.int64)
-    found = detector.find(solver.poses(), np.zeros(count + 1), nothing, moves)
+    detector = CollisionDetector(solver.all_geometries, solver.walls, len(solver.bodies))
+    detector.find(solver.poses(), np.zeros(count + 1), moves)
+    found = detector.contacts()
     depth = np.maximum(-found.gap, 0.0)
     speed = np.sqrt(np.square(solver.bodies.velocity).sum(axis=1))
     return {
@@ -215,6 +256,7 @@ def main() -> dict[str, Any]:
     parser.add_argument("--frames", type=int, default=90)
     parser.add_argument("--hulls", action="store_true", help="stones into a bowl instead of boxes into a pit")
     parser.add_argument("--blender", action="store_true", help="also Blender's own rigid bodies")
+    parser.add_argument("--fast", action="store_true", help="also with a fast ball beside it")
     parser.add_argument("--as-blender", type=Path, help=argparse.SUPPRESS)
     asked, _ = parser.parse_known_args()
     if asked.as_blender:
@@ -226,6 +268,8 @@ def main() -> dict[str, Any]:
             stone, file = Path(folder, "stone.ply"), Path(folder, "scene.json")
             parameters = hulls_in_a_bowl(count, stone) if arguments.hulls else boxes_in_a_pit(count)
             fall = {"bodies": count, **measure(parameters, arguments.frames)}
+            if arguments.fast:
+                fall["with_fast_ball"] = measure_fast(parameters, arguments.frames)
             if arguments.blender:
                 fall["blender"] = measure_blender(parameters, arguments.frames, file)
                 for time_of in ("seconds", "processor_seconds"):

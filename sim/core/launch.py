@@ -19,9 +19,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import taichi as ti
 from taichi.lang import impl
-from taichi.lang.matrix import VectorType
+from taichi.lang.matrix import MatrixType, VectorType
+from taichi.lang.util import to_numpy_type
 from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
 
@@ -118,16 +120,21 @@ class FastKernel:
         """Launch; waits for the device only where the kernel returns something."""
         return self.later(*args)()
 
-    def later(self, *args: Any) -> Callable[[], Any]:
-        """Launch; what is returned is called for the result, which waits for the device unless somebody has since.
-
-        To be called before the kernel is launched again.
-        """
+    def _enter_program(self) -> Any:
+        """Taichi's program; of one before nothing is kept."""
         program = impl.get_runtime().prog
         if program is not self._program:
             self._program, self._compiled, self._launches = program, {}, {}
             arch = impl.current_cfg().arch
             self._on_cpu, self._on_cuda = arch in (ti.x64, ti.arm64), arch == ti.cuda
+        return program
+
+    def later(self, *args: Any) -> Callable[[], Any]:
+        """Launch; what is returned is called for the result, which waits for the device unless somebody has since.
+
+        To be called before the kernel is launched again.
+        """
+        program = self._enter_program()
         used = self._used(args)
         arrays = [used[index] for index, _ in self._arrays]
         key = (*[used[index] for index in self._templates], *map(id, arrays))
@@ -236,7 +243,7 @@ class FastKernel:
             launch.graph.launch(is_changed=is_changed)
         return context
 
-    def _result(self, program: Any, launch: _Launch, context: Any, waits: int) -> Any:
+    def _result(self, program: Any, launch: _Launch | None, context: Any, waits: int) -> Any:
         """What a launch returned, before which there were so many waits."""
         if self._primal.return_type is None:
             return None
@@ -244,7 +251,7 @@ class FastKernel:
             if waits == _waits[0]:
                 program.synchronize()
                 _waits[0] += 1
-            if launch.graph is not None:
+            if launch is not None and launch.graph is not None:
                 launch.graph.take_result()
         kind = self._primal.return_type[0]
         if self._returns_vector:
@@ -256,6 +263,7 @@ class FastKernel:
         """Note how each argument that is used is passed, and at which place among those that are no templates."""
         self._templates: list[int] = []
         self._arrays: list[tuple[int, tuple[int]]] = []
+        self._host_types: dict[tuple[int], tuple[np.dtype[Any], int, int]] = {}  # numpy's, its axes, those of elements
         self._floats: list[tuple[int, tuple[int]]] = []
         self._integers: list[tuple[int, tuple[int]]] = []
         self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
@@ -282,6 +290,9 @@ class FastKernel:
     def _sort_argument(self, index: int, place: int, annotation: Any) -> None:
         if isinstance(annotation, NdarrayType):
             self._arrays.append((index, (place,)))
+            of_elements = annotation.dtype.ndim if isinstance(annotation.dtype, MatrixType) else 0
+            kind = annotation.dtype.dtype if of_elements else annotation.dtype
+            self._host_types[place,] = np.dtype(to_numpy_type(kind)), annotation.ndim + of_elements, of_elements
         elif isinstance(annotation, VectorType):
             vectors = self._float_vectors if annotation.dtype in primitive_types.real_types else self._integer_vectors
             vectors.append((index, [(place, axis) for axis in range(annotation.n)]))
@@ -335,10 +346,49 @@ def large_kernel(function: Callable[..., Any]) -> FastKernel:
     return FastKernel(ti.kernel(with_fields_as_arguments(function)), is_large=True)
 
 
-def kernel_of_host_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator in place of `ti.kernel`: bundles may hold numpy's arrays, too, which Taichi itself passes on.
+class HostArraysKernel(FastKernel):
+    """A kernel whose arrays may also be numpy's, of other sizes in every launch.
 
-    For arrays whose sizes change from launch to launch: one costs some 10 us, and on a GPU its way there and back.
+    On a CPU their addresses are passed, in some 10 us a launch; elsewhere Taichi copies them there and back.
+
+    Raises:
+        TypeError: an array is of another type, has more or fewer axes, or is not stored row by row.
     """
-    launched = ti.kernel(with_fields_as_arguments(function))
-    return functools.wraps(function)(lambda *args: launched(*flattened(args)))
+
+    def later(self, *args: Any) -> Callable[[], Any]:
+        """Launch; what is returned is called for the result."""
+        if not any(isinstance(value, np.ndarray) for value in flattened(args)):
+            return super().later(*args)
+        program = self._enter_program()
+        if not self._on_cpu:
+            result = self._primal(*flattened(args))
+            return lambda: result
+        used = self._used(args)
+        compiled = self._compiled.get(self._key(used))
+        if compiled is None:
+            result = self._first_call(program, args)
+            return lambda: result
+        kernel, executable, _ = compiled
+        context = kernel.make_launch_context()
+        for index, place in self._arrays:
+            array, (kind, axes, of_elements) = used[index], self._host_types[place]
+            if not isinstance(array, np.ndarray):
+                size, shape = array.arr.nelement() * array.arr.element_size(), array.shape
+                address = program.get_ndarray_data_ptr_as_int(array.arr)
+            elif array.dtype == kind and array.ndim == axes and array.flags.c_contiguous:
+                size, shape, address = array.nbytes, array.shape[: axes - of_elements], array.ctypes.data
+            else:
+                raise TypeError(f"{self.__name__} got an array of {array.ndim} axes of {array.dtype}, takes {kind}")
+            context.set_arg_external_array_with_shape(place, address, size, shape, 0)
+        self._pass_numbers(context, used, [None] * len(used))
+        program.launch_kernel(executable, context)
+        return functools.partial(self._result, program, None, context, 0)
+
+    def _key(self, used: Sequence[Any]) -> tuple[Any, ...]:
+        """Compile-time values alone: these kernels name the types of all arrays."""
+        return tuple(used[index] for index in self._templates)
+
+
+def kernel_of_host_arrays(function: Callable[..., Any]) -> HostArraysKernel:
+    """Decorator in place of `ti.kernel`: bundles may hold numpy's arrays, too."""
+    return HostArraysKernel(ti.kernel(with_fields_as_arguments(function)))

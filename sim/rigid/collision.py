@@ -4,25 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 from taichi.lang import impl
 
+from sim.core.host_access import copied, put, viewed
 from sim.core.motion.paths import Poses
 from sim.core.reductions import runs_on_gpu
+from sim.core.scan import scan_scratch_length
 from sim.core.scheduling import LEAST_RUN
 from sim.core.solver import Arrays
 from sim.core.walls import Wall
-from sim.rigid.broad_phase import NearBoxes
+from sim.rigid import collision_kernels as kernels
+from sim.rigid.broad_phase import overlapping_pairs
 from sim.rigid.collision_shapes import CollisionShapes
-from sim.rigid.contacts import BODY_BITS, AnchoredContacts, Array, Contacts, Indices, pair_keys, rows_of
+from sim.rigid.contacts import BODY_BITS, WALL_BITS, Array, Contacts, Indices, pair_keys, rows_of
+from sim.rigid.polytope_kernels import find_polytope_contacts
+from sim.rigid.tables import fill, kept, larger, larger_tables
 from sim.shapes.body_geometry import BodyGeometry
 
-CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
-TRUSTED_MOTION = 1.0e-3  # contacts are looked for anew after surfaces moved so far, in the same unit
-BLOCKS = 512  # of pairs that a GPU looks at side by side
+STEPS_AHEAD, ROOM = 5.0, 0.05
+"""Near pairs are searched for with room for the motion of so many steps, and for a part of their shortest edges."""
+LARGEST_WORK = 1 << 25  # numbers that pairs need which a GPU looks at side by side
+MOST_BLOCKS = 1 << 14  # of these pairs
+HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio
+COLUMNS = {"pairs": 4, "features": 2, "planes": 6, "balls": 4, "forces": 3, "bodies": 2, "point": 3, "normal": 3}
+"""Of arrays of pairs and of contacts."""
 
 
 class CollisionDetector:
@@ -30,29 +40,41 @@ class CollisionDetector:
 
     Bodies are numbered: moving ones, static ones, and last the domain, which stands still at the origin. A pair is
     examined again when its surfaces may have moved by more than `TRUSTED_MOTION`; until then its contacts are followed
-    (`AnchoredContacts`), all within that distance included.
+    (`collision_kernels.Kept`), all within that distance included.
 
     Attributes:
-        followed: the contacts that are being followed, by pair.
+        deepest: overlap that was found last [m].
         untouching: keys of pairs of bodies that do not touch each other, as joints hold them, ascending.
 
     Raises:
         ValueError: there are too many bodies for the keys of contacts.
     """
 
-    def __init__(self, geometries: Sequence[BodyGeometry], walls: Sequence[Wall]) -> None:
-        """Take all bodies but the domain."""
-        self._geometries, self._walls = tuple(geometries), tuple(walls)
+    def __init__(self, geometries: Sequence[BodyGeometry], walls: Sequence[Wall], moving: int) -> None:
+        """Take all bodies but the domain; so many of them move."""
+        self._geometries, self._walls, self._moving = tuple(geometries), tuple(walls), moving
         self._domain = len(geometries)
         if self._domain >= 1 << BODY_BITS:
             raise ValueError(f"there are {self._domain:,} rigid bodies; at most {(1 << BODY_BITS) - 1:,} can meet")
         self._centre = np.stack([geometry.bounds.mean(axis=0) for geometry in geometries])
         self._half_edges = np.stack([0.5 * np.ptp(geometry.bounds, axis=0) for geometry in geometries])
-        self._size = np.array([*(geometry.shortest_edge for geometry in geometries), np.inf])
-        self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
-        self.followed = AnchoredContacts.joined([])
-        self._boxes = NearBoxes()
-        self.untouching = np.zeros(0, dtype=np.int64)
+        self._size = np.array([*(geometry.shortest_edge for geometry in geometries), kernels.FAR])
+        self._untouching = np.zeros(0, dtype=np.int64)
+        self._pairs, self._outer = np.zeros((0, 4), dtype=np.int32), np.zeros((self._domain, 6))
+        self._moved, self._must_search, self._is_renewed = np.zeros(self._domain + 1), True, False
+        self._rows: Any = slice(0, 0)
+        self._total, self.deepest, self._was_active = 0, 0.0, np.zeros(self._domain, dtype=bool)
+        self._near = self._found = self._kept = self._spare = self._placed = self._scratch = None
+
+    @property
+    def untouching(self) -> Indices:
+        """Keys of pairs of bodies that do not touch each other, as joints hold them, ascending."""
+        return self._untouching
+
+    @untouching.setter
+    def untouching(self, keys: Indices) -> None:
+        if not np.array_equal(keys, self._untouching):
+            self._untouching, self._must_search = keys, True
 
     def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
         """Those of some pairs of bodies, the lower number first, that may touch, (p,) each."""
@@ -63,75 +85,153 @@ class CollisionDetector:
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The contacts that are being followed: bodies that rest on others than before would tremble."""
-        found = self.followed
         return {
             "near_pairs": self._pairs.copy(),
-            "near_budgets": self._budget.copy(),
-            "followed_numbers": np.stack([found.owner, found.other, found.side, found.feature], axis=1),
-            "followed_places": np.concatenate(
-                [found.centre, found.radius[:, None], found.anchor, found.outward], axis=1
-            ),
+            "near_budgets": self._budgets(),
+            "near_boxes": self._outer.copy(),
+            "near_motion": self._moved.copy(),
+            "contact_starts": self._starts().copy(),
+            **{
+                f"contact_{name}": copied(getattr(self._kept, name))[: self._total]
+                if self._total
+                else np.zeros((0, COLUMNS[name]))
+                for name in ("features", "planes", "balls", "forces")
+            },
         }
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint. Raises ValueError when an array is missing."""
-        for name in ("near_pairs", "near_budgets", "followed_numbers", "followed_places"):
+        names = ("near_pairs", "near_budgets", "near_boxes", "near_motion", "contact_starts")
+        rows = ("features", "planes", "balls", "forces")
+        for name in (*names, *(f"contact_{each}" for each in rows)):
             if name not in arrays:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
-        self._pairs = np.array(arrays["near_pairs"], dtype=np.int64)
-        self._budget = np.array(arrays["near_budgets"], dtype=np.float64)
-        owner, other, side, feature = np.array(arrays["followed_numbers"], dtype=np.int64).reshape(-1, 4).T
-        places = np.array(arrays["followed_places"], dtype=np.float64).reshape(-1, 10)
-        self.followed = AnchoredContacts(
-            owner, other, side, feature, places[:, :3], places[:, 3], places[:, 4:7], places[:, 7:]
-        )
+        pairs, budgets, outer, moved, starts = (np.array(arrays[name]) for name in names)
+        self._take_pairs(pairs.astype(np.int32), np.full(len(pairs), -1), budgets)
+        self._outer, self._moved, self._must_search = outer, moved, False
+        put(self._outer_on_device, outer)
+        self._total = int(starts[-1])
+        self._kept = self._larger_kept(self._kept, self._total)
+        fill(self._kept.starts, starts.astype(np.int32))
+        for name in rows:
+            fill(getattr(self._kept, name), np.array(arrays[f"contact_{name}"]))
+        fill(self._near.before, np.arange(len(pairs), dtype=np.int32))
 
-    def find(self, poses: Poses, motion: Array, last: Indices, is_active: NDArray[np.bool_]) -> Contacts:
-        """The contacts of all active bodies in poses, by pair, in order of their numbers.
+    def find(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> None:
+        """Find the contacts of all active bodies in poses.
 
-        The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the last step,
-        by their ascending keys, are preferred among equals. Contacts of bodies that are not active are kept.
+        The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the step
+        before are preferred among equals. Contacts of bodies that are not active are kept.
         """
-        lower, upper = self.boxes(poses)
-        first, second, wall = self._near(lower, upper, poses, motion, is_active)
-        pairs, of_task = np.unique(pair_keys(first, second), return_inverse=True)
-        ahead = motion[pairs >> BODY_BITS] + motion[pairs & ((1 << BODY_BITS) - 1)]
-        budget = np.full(len(pairs), -np.inf)
-        if len(self._pairs):
-            rows, is_known = rows_of(pairs, self._pairs)
-            budget[is_known] = self._budget[rows[is_known]]
-        is_stale = ahead > budget
+        self.look(poses, motion)
+        bodies, count = self._bodies, len(self._pairs)
+        put(bodies.moved, self._moved)
+        put(bodies.is_active, np.append(is_active, False))
+        self._moved = np.zeros(self._domain + 1)
+        self._was_active, self._total, self.deepest = is_active, 0, 0.0
+        if not count:
+            return
+        near, walls = self._near, self.walls
+        tasks = kernels.choose_pairs(count, bodies, near, walls)
+        rows = tasks * kernels.MOST_KEPT
+        self._found = larger_tables(kernels.Found, self._found, COLUMNS, rows, counts=tasks, clearances=tasks)
+        if self._kept is None:
+            self._kept = self._larger_kept(None, 0)
+        for examine, is_there, tables, room, rows in (
+            (find_polytope_contacts, self._shapes.has_polytopes, self._shapes.polytopes, self._shapes.most_vertices, 3),
+            (kernels.find_contacts, self._shapes.has_others, self._shapes.on_device, self._shapes.most_balls, 1),
+        ):
+            if tasks and is_there:
+                work, blocks = self._work(2 * room * rows)
+                examine(tasks, bodies, near, self._kept, walls, tables, 2 * room, blocks, self._run, work, self._found)
+        following = self._larger_kept(self._spare, 0)
+        self._total = kernels.count_contacts(count, bodies, near, self._found, self._kept, following)
+        following = self._larger_kept(following, self._total)
+        self._placed = larger_tables(kernels.Placed, self._placed, COLUMNS, self._total)
+        found = kernels.place_contacts(count, bodies, near, self._found, self._kept, following, self._placed)
+        self.deepest = 1.0e-9 * found
+        self._kept, self._spare = following, self._kept
+        if self._is_renewed:
+            fill(near.before, np.arange(count, dtype=np.int32))
+            self._is_renewed = False
 
-        # What no active body belongs to stays as it is.
-        asleep = ~self._is_of(self._pairs, is_active)
-        stays = np.concatenate([pairs[~is_stale], self._pairs[asleep]])
-        owned = pair_keys(self.followed.first, self.followed.second)
-        kept = self.followed.chosen(np.flatnonzero(np.isin(owned, stays)))
-        tasks = np.flatnonzero(is_stale[of_task])
-        found, clearance = self._examine(first[tasks], second[tasks], wall[tasks], poses, motion, last)
-        clear = np.full(len(pairs), np.inf)
-        np.minimum.at(clear, of_task[tasks], clearance - CONTACT_BAND * self._smaller(first[tasks], second[tasks]))
-        budget = np.where(is_stale, clear, budget)
-        if len(found) or len(kept) != len(self.followed):
-            joined = AnchoredContacts.joined([kept, found])
-            order = np.argsort(pair_keys(joined.first, joined.second), kind="stable")
-            self.followed = joined.chosen(order)
-        order = np.argsort(np.concatenate([pairs, self._pairs[asleep]]))
-        self._budget = np.concatenate([budget, self._budget[asleep]])[order]
-        self._pairs = np.concatenate([pairs, self._pairs[asleep]])[order]
-        if not asleep.any():
-            return self.followed.at(poses)
-        owned = pair_keys(self.followed.first, self.followed.second)
-        return self.followed.chosen(np.flatnonzero(self._is_of(owned, is_active))).at(poses)
+    def look(self, poses: Poses, motion: Array) -> None:
+        """See to it that all pairs are known that may get near where surfaces may get so far [m], (n + 1,)."""
+        put(self._bodies.pose, np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1))
+        put(self._bodies.motion, motion)
+        if kernels.place_boxes(self._bodies, self._domain, self._outer_on_device) > 0 or self._must_search:
+            self._search(poses, motion)
+
+    def contacts(self) -> Contacts:
+        """Those found last of active bodies, by pair, in order of the numbers of bodies."""
+        self._rows = slice(0, self._total)
+        if not self._total:
+            nobody, nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+            return Contacts(nobody, nobody, np.zeros((0, 2), dtype=np.int32), nothing, nothing, nothing[:, 0], nothing)
+        placed, kept = self._placed, self._kept
+        bodies: NDArray[np.int32] = viewed(placed.bodies)[self._rows]
+        if not self._was_active[: self._moving].all():
+            among = np.append(self._was_active, False)
+            self._rows = np.flatnonzero(among[bodies].any(axis=1))
+            bodies = bodies[self._rows]
+        features, point, normal, gap, force = (
+            viewed(each)[self._rows] for each in (kept.features, placed.point, placed.normal, placed.gap, kept.forces)
+        )
+        first, second = bodies.astype(np.int64).T
+        return Contacts(first, second, features, point, normal, gap, force)
+
+    def active_count(self) -> int:
+        """How many contacts were found last of active bodies."""
+        if not self._total or self._was_active[: self._moving].all():
+            return self._total
+        among = np.append(self._was_active, False)
+        return int(np.count_nonzero(among[viewed(self._placed.bodies)[: self._total]].any(axis=1)))
+
+    def keep_forces(self, forces: Array) -> None:
+        """Note forces of those that `contacts` gave last [N], (k, 3), from which the next step starts."""
+        if self._total:
+            everything: NDArray[np.float64] = viewed(self._kept.forces)
+            everything[self._rows] = forces
+            if runs_on_gpu():
+                put(self._kept.forces, everything)
+
+    @property
+    def pair_count(self) -> int:
+        """Of pairs that are near, or may get so soon."""
+        return len(self._pairs)
+
+    def on_device(self) -> tuple[Any, Any, Any, Any]:
+        """What was found last: bundles of `collision_kernels.Near`, `Kept`, `Bodies` and `Placed`."""
+        return self._near, self._kept, self._bodies, self._placed
 
     def follow(self, motion: Array) -> None:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
-        first, second = self.near()
-        self._budget -= motion[first] + motion[second]
+        self._moved = self._moved + motion
 
     def near(self) -> tuple[Indices, Indices]:
         """The pairs of bodies that were near in the last step, (p,) each; the domain is one."""
-        return self._pairs >> BODY_BITS, self._pairs & ((1 << BODY_BITS) - 1)
+        if not len(self._pairs):
+            nothing = np.zeros(0, dtype=np.int64)
+            return nothing, nothing
+        is_near = viewed(self._near.action)[: len(self._pairs)] != kernels.DROPPED
+        first, second = self._pairs[is_near, :2].astype(np.int64).T
+        return first, second
+
+    def overlapping(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> tuple[Indices, Indices]:
+        """Pairs of bodies whose boxes overlap with what surfaces may reach, and that may touch, (p,) each.
+
+        One at least is active. Surfaces get so far in the step [m], (n + 1,).
+        """
+        self.look(poses, motion)
+        lower, upper = self.boxes(poses)
+        reach = ((kernels.CONTACT_BAND + kernels.TRUSTED_MOTION) * self._size[:-1] + motion[:-1])[:, None]
+        lower, upper = lower - reach, upper + reach
+        first, second = self._between
+        found = is_active[first] | is_active[second]
+        for axis in range(3):
+            low, high = lower[:, axis], upper[:, axis]
+            found &= (low[first] <= high[second]) & (low[second] <= high[first])
+        return first[found], second[found]
 
     def boxes(self, poses: Poses) -> tuple[Array, Array]:
         """Lower and upper corners of all bodies' axis-aligned boxes [m], (n, 3) each."""
@@ -140,139 +240,114 @@ class CollisionDetector:
         half = np.einsum("nij,nj->ni", np.abs(turned), self._half_edges)
         return centre - half, centre + half
 
+    def _search(self, poses: Poses, motion: Array) -> None:
+        """The broad phase."""
+        lower, upper = self.boxes(poses)
+        reach = (kernels.CONTACT_BAND + kernels.TRUSTED_MOTION) * self._size[:-1] + motion[:-1]
+        reach = (reach + STEPS_AHEAD * motion[:-1] + ROOM * (upper - lower).min(axis=1))[:, None]
+        lower, upper = lower - reach, upper + reach
+        moves = np.arange(self._domain) < self._moving
+        first, second = self.touching(*overlapping_pairs(lower, upper, moves))
+        parts = [np.stack([first, second, np.full(len(first), -1), self._shapes.sides(first, second)], axis=1)]
+        for number, wall in enumerate(self._walls):
+            depth = wall.offset - lower[:, wall.axis] if wall.side > 0.0 else upper[:, wall.axis] - wall.offset
+            at = np.flatnonzero(moves & (depth >= 0.0))
+            columns = (at, np.full(len(at), self._domain), np.full(len(at), number), self._shapes.sides_at_wall(at))
+            parts.append(np.stack(columns, axis=1))
+        pairs = np.concatenate(parts)
+        keys = _keys_of(pairs)
+        order = np.argsort(keys)
+        before, budgets = np.full(len(pairs), -1), np.full(len(pairs), -kernels.FAR)
+        if len(self._pairs):
+            rows, is_known = rows_of(keys[order], _keys_of(self._pairs))
+            # Contacts are of the pairs that they were last looked for in.
+            numbers = np.arange(len(self._pairs))
+            if self._is_renewed:
+                numbers = viewed(self._near.before)[: len(self._pairs)]
+            before[is_known], budgets[is_known] = numbers[rows[is_known]], self._budgets()[rows[is_known]]
+        self._take_pairs(pairs[order].astype(np.int32), before, budgets)
+        self._outer, self._must_search = np.concatenate([lower, upper], axis=1), False
+        put(self._outer_on_device, self._outer)
+
+    def _take_pairs(self, pairs: NDArray[np.int32], before: Indices, budgets: Array) -> None:
+        """Look at other pairs from now on, which had these numbers before or -1, and have budgets [m]."""
+        self._pairs = pairs
+        first, second = pairs[pairs[:, 2] < 0, :2].astype(np.int64).T
+        self._between = first, second
+        count = len(pairs)
+        sums = scan_scratch_length(2 * count + 1)
+        self._near = larger_tables(kernels.Near, self._near, COLUMNS, count, place=count + 1, sums=sums)
+        fill(self._near.pairs, pairs)
+        fill(self._near.before, before.astype(np.int32))
+        fill(self._near.budget, budgets)
+        # Of Knuth's multiplicative hash.
+        rank = np.empty(count, dtype=np.int32)
+        rank[np.argsort(_keys_of(pairs).astype(np.uint64) * HASH)] = np.arange(count)
+        fill(self._near.rank, rank)
+        self._is_renewed = True
+
+    def _budgets(self) -> Array:
+        return copied(self._near.budget)[: len(self._pairs)] if len(self._pairs) else np.zeros(0)
+
+    def _starts(self) -> NDArray[np.int32]:
+        """Where contacts of each of the pairs begin, and the end, (p + 1,)."""
+        # Where pairs were searched for since contacts were, these are of the pairs before.
+        if not self._total or self._is_renewed:
+            return np.zeros(len(self._pairs) + 1, dtype=np.int32)
+        starts: NDArray[np.int32] = viewed(self._kept.starts)[: len(self._pairs) + 1]
+        return starts
+
+    # --- arrays on the device ---
+
     @cached_property
     def _shapes(self) -> CollisionShapes:
         return CollisionShapes(self._geometries)
 
     @cached_property
-    def _work(self) -> ti.Ndarray:
-        from sim.rigid.collision_kernels import SCRATCH
-
-        return ti.ndarray(ti.f64, (self._blocks * 2 * self._shapes.most_balls, SCRATCH))
+    def _bodies(self) -> kernels.Bodies:
+        count = self._domain
+        return kernels.Bodies(
+            ti.ndarray(ti.f64, (count + 1, 12)),
+            kept(self._shapes.of_body),
+            kept(self._size),
+            ti.ndarray(ti.f64, count + 1),
+            ti.ndarray(ti.f64, count + 1),
+            ti.ndarray(ti.i32, count + 1),
+            kept(np.concatenate([self._centre, self._half_edges], axis=1)),
+            ti.ndarray(ti.f64, (count, 6)),
+        )
 
     @cached_property
-    def _own_work(self) -> ti.Ndarray:
-        from sim.rigid.collision_kernels import SCRATCH
-
-        return ti.ndarray(ti.f64, (self._blocks * 6 * self._shapes.most_vertices, SCRATCH))
+    def _outer_on_device(self) -> ti.Ndarray:
+        return kept(self._outer)
 
     @cached_property
-    def _blocks(self) -> int:
-        """Of pairs that are looked at side by side: one a thread of a CPU."""
-        return BLOCKS if runs_on_gpu() else int(impl.current_cfg().cpu_max_num_threads)
+    def walls(self) -> ti.Ndarray:
+        """What kernels read of walls, see `collision_kernels.find_contacts`."""
+        rows = [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls]
+        return kept(np.array(rows or [[0.0] * 7]))
 
     @cached_property
     def _run(self) -> int:
         return 1 if runs_on_gpu() else LEAST_RUN
 
-    def _is_of(self, pairs: Indices, is_active: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Whether one body of a pair is active, (k,)."""
-        among = np.append(is_active, False)
-        result: NDArray[np.bool_] = among[pairs >> BODY_BITS] | among[pairs & ((1 << BODY_BITS) - 1)]
-        return result
+    def _work(self, rows: int) -> tuple[ti.Ndarray, int]:
+        """Room for the candidates of pairs that are looked at side by side, so many rows each, and how many they are.
 
-    def _smaller(self, first: Indices, second: Indices) -> Array:
-        """Shortest edge of the smaller body of pairs [m], (k,)."""
-        return np.minimum(self._size[first], self._size[second])
+        On a CPU one a thread.
+        """
+        blocks = int(impl.current_cfg().cpu_max_num_threads)
+        if runs_on_gpu():
+            blocks = max(1, min(MOST_BLOCKS, LARGEST_WORK // (rows * kernels.SCRATCH)))
+        self._scratch = larger(self._scratch, (blocks * rows, kernels.SCRATCH), ti.f64)
+        return self._scratch, blocks
 
-    def _margin(self, first: Indices, second: Indices, motion: Array) -> Array:
-        """Gap up to which contacts of pairs are looked for [m], (k,)."""
-        return (CONTACT_BAND + TRUSTED_MOTION) * self._smaller(first, second) + motion[first] + motion[second]
+    def _larger_kept(self, tables: Any, contacts: int) -> Any:
+        """Room for so many contacts of the pairs."""
+        return larger_tables(kernels.Kept, tables, COLUMNS, contacts, starts=len(self._pairs) + 1)
 
-    def _near(
-        self, lower: Array, upper: Array, poses: Poses, motion: Array, is_active: NDArray[np.bool_]
-    ) -> tuple[Indices, Indices, Indices]:
-        """Pairs whose boxes are within their margins, and the wall that is meant, or -1: (k,) each, by pair."""
-        reach = ((CONTACT_BAND + TRUSTED_MOTION) * self._size[:-1] + motion[:-1])[:, None]
-        boxes = self._boxes.overlapping(lower - reach, upper + reach, motion[:-1], is_active)
-        first, second = self.touching(*boxes)
-        apart = np.maximum(lower[first] - upper[second], lower[second] - upper[first]).max(axis=1)
-        near = apart <= self._margin(first, second, motion)
-        pairs = [(first[near], second[near], np.full(np.count_nonzero(near), -1))]
-        bodies = np.flatnonzero(is_active)
-        margin = self._margin(bodies, np.full(len(bodies), self._domain), motion)
-        for number, wall in enumerate(self._walls):
-            apart = (
-                lower[bodies, wall.axis] - wall.offset if wall.side > 0.0 else wall.offset - upper[bodies, wall.axis]
-            )
-            # A body that left by an open face falls on.
-            inside = wall.side * (poses.position[bodies, wall.axis] - wall.offset) > 0.0
-            at = bodies[(apart <= margin) & inside]
-            pairs.append((at, np.full(len(at), self._domain), np.full(len(at), number)))
-        first, second, wall_number = (np.concatenate(each) for each in zip(*pairs, strict=True))
-        order = np.lexsort((wall_number, second, first))
-        return first[order], second[order], wall_number[order]
 
-    def _examine(
-        self, first: Indices, second: Indices, wall: Indices, poses: Poses, motion: Array, last: Indices
-    ) -> tuple[AnchoredContacts, Array]:
-        """Contacts of some pairs that are near, and up to which gap [m] these are all of each pair."""
-        clearance = self._margin(first, second, motion)
-        shapes = self._shapes
-        exact = shapes.are_polytopes(first) & ((wall >= 0) | shapes.are_polytopes(np.minimum(second, self._domain - 1)))
-        parts = []
-        for by_balls in (False, True):
-            rows = np.flatnonzero(exact != by_balls)
-            if len(rows):
-                near = first[rows], second[rows], wall[rows], clearance[rows]
-                part, clearance[rows] = self._examine_alike(*near, poses, last, by_balls)
-                parts.append(part)
-        return AnchoredContacts.joined(parts), clearance
-
-    def _examine_alike(
-        self, first: Indices, second: Indices, wall: Indices, margin: Array, poses: Poses, last: Indices, by_balls: bool
-    ) -> tuple[AnchoredContacts, Array]:
-        """Likewise, within gaps [m], (k,), of pairs that are all looked at as polytopes or all by their balls."""
-        from sim.rigid.collision_kernels import MOST_KEPT, Bodies, Found, Tasks, find_contacts
-        from sim.rigid.polytope_kernels import find_polytope_contacts
-
-        shapes, count = self._shapes, len(first)
-        sides = np.where(wall >= 0, 1, shapes.sides(first, np.minimum(second, self._domain - 1)))
-        tasks = Tasks(
-            np.ascontiguousarray(np.stack([first, second, wall, sides], axis=1), dtype=np.int32),
-            margin,
-        )
-        bodies = Bodies(np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1), shapes.of_body)
-        walls = np.array(
-            [[each.axis, each.side, each.offset, *each.lower, *each.upper] for each in self._walls] or [[0.0] * 7]
-        )
-        counts, room = np.zeros(count, dtype=np.int32), count * MOST_KEPT
-        features, planes, balls = np.empty((room, 2), dtype=np.int32), np.empty((room, 6)), np.empty((room, 4))
-        found = Found(counts, features, planes, np.empty(room), margin.copy())
-        known = np.concatenate([[-1], last])
-        if by_balls:
-            room = 2 * shapes.most_balls
-            find_contacts(
-                tasks, bodies, walls, known, shapes.on_device, room, self._blocks, self._run, self._work, found
-            )
-        else:
-            room = 2 * shapes.most_vertices
-            find_polytope_contacts(
-                tasks,
-                bodies,
-                walls,
-                known,
-                shapes.polytopes,
-                room,
-                self._blocks,
-                self._run,
-                self._own_work,
-                found,
-                balls,
-            )
-        task = np.repeat(np.arange(count), counts)
-        rows = np.arange(len(task)) - np.repeat(np.cumsum(counts) - counts, counts) + MOST_KEPT * task
-        side, feature = features[rows].astype(np.int64).T
-        owner = np.where(side == 0, first[task], second[task])
-        balls = shapes.balls_of(owner, feature) if by_balls else balls[rows]
-        contacts = AnchoredContacts(
-            owner=owner,
-            other=np.where(side == 0, second[task], first[task]),
-            side=side,
-            feature=feature,
-            centre=balls[:, :3],
-            radius=balls[:, 3],
-            anchor=planes[rows, :3],
-            outward=planes[rows, 3:],
-        )
-        return contacts, found.clearances
+def _keys_of(pairs: NDArray[np.integer]) -> Indices:
+    """Numbers of pairs, (p,), in the order of their bodies, and of walls."""
+    first, second, wall = pairs[:, :3].astype(np.int64).T
+    return (pair_keys(first, second) << WALL_BITS) + wall + 1

@@ -1,4 +1,8 @@
-"""Contacts of pairs of bodies that are near: the balls of each against the distance of the other, reduced to few."""
+"""Contacts of pairs of bodies that are near: the balls of each against the distance of the other, reduced to few.
+
+Pairs are kept in order, and their contacts in the order of the pairs, from step to step: pairs that have moved are
+looked at again, and what is known of the others, and the forces of contacts that are found again, goes along.
+"""
 
 import math
 from typing import NamedTuple
@@ -6,15 +10,15 @@ from typing import NamedTuple
 import taichi as ti
 
 from sim.core.bundles import bundle, func
-from sim.core.launch import kernel_of_host_arrays
+from sim.core.launch import kernel, kernel_of_host_arrays
+from sim.core.scan import scan_in_parallel
 from sim.rigid.contact_kernels import tangents_of
-from sim.rigid.contacts import BODY_BITS, FEATURE_BITS, KEPT_BONUS, MOST_PATCHES, SAME_PATCH, WALL_BITS
+from sim.rigid.contacts import FEATURE_BITS, KEPT_BONUS, MOST_PATCHES, SAME_PATCH, WALL_BITS
 
 Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
 Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
 Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
 WholeRows = ti.types.ndarray(dtype=ti.i32, ndim=2)
-Keys = ti.types.ndarray(dtype=ti.i64, ndim=1)
 Distances = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Vector3 = ti.types.vector(3, ti.f64)
 Vector8 = ti.types.vector(8, ti.f64)
@@ -31,6 +35,9 @@ SCRATCH = (
     18  # columns: centre, outward (in the other's frame), distance, radius, point, normal, gap, side, feature, use
 )
 FREE, DONE, IN_PATCH, CHOSEN = 0.0, 1.0, 2.0, 3.0  # uses of a candidate
+DROPPED, KEPT, EXAMINED = range(3)  # what happens to the contacts of a pair in a step
+CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
+TRUSTED_MOTION = 1.0e-3  # contacts are looked for anew after surfaces moved so far, in the same unit
 FAR = 1.0e30  # more than any length, and a number in float32, as kernels read it
 _HALF_CELL_DIAGONAL = 0.87  # by which grids err at most, in cells
 
@@ -49,29 +56,69 @@ class Shapes(NamedTuple):
 
 @bundle
 class Bodies(NamedTuple):
-    """Where bodies are."""
+    """Where bodies are, and the domain, which is the last."""
 
     pose: Rows  # position and rotation, row by row, (b, 12)
-    shape: Whole  # number of the shape, (b,)
+    shape: Whole  # number of the shape, (b - 1,)
+    size: Numbers  # shortest edges [m], (b,)
+    motion: Numbers  # how far surfaces may get in the coming step [m], (b,)
+    moved: Numbers  # how far they got since contacts were last looked for [m], (b,)
+    is_active: Whole  # (b,)
+    rest_box: Rows  # centre and half edges of a box around each, in its frame [m], (b - 1, 6)
+    box: Rows  # corners of axis-aligned boxes [m], (b - 1, 6)
 
 
 @bundle
-class Tasks(NamedTuple):
-    """Pairs to be looked at."""
+class Near(NamedTuple):
+    """Pairs of bodies that may come near, in ascending order, and those of the broad phase before."""
 
     pairs: WholeRows  # first and second body, the wall that stands for the second or -1, whose balls: 1, 2, 3 both
-    margins: Numbers  # gap up to which contacts are looked for [m], (t,)
+    before: Whole  # numbers of the pairs in the step before, or -1, (p,)
+    budget: Numbers  # how far surfaces may get until the pair is looked at again [m], (p,)
+    action: Whole  # (p,)
+    place: Whole  # of an examined pair among these, (p + 1,)
+    tasks: Whole  # the examined pairs, (p,)
+    numbers: Whole  # room for what is added up, (p,)
+    sums: Whole  # likewise
+    rank: Whole  # places in an order by chance, which is always the same for the same bodies, (p,)
 
 
 @bundle
 class Found(NamedTuple):
-    """Contacts of the pairs."""
+    """Contacts of the pairs that are examined, (t,)."""
 
     counts: Whole  # of each pair, (t,)
     features: WholeRows  # side and number of the ball of each, (t MOST_KEPT, 2)
     planes: Rows  # anchor [m] and normal in the other's frame, (t MOST_KEPT, 6)
     heights: Numbers  # of the centre of the ball above its plane [m], (t MOST_KEPT,)
+    balls: Rows  # centre, in the frame of its body, and radius [m], (t MOST_KEPT, 4)
     clearances: Numbers  # up to which gap they are all of the pair [m]: its margin or more, (t,)
+
+
+@bundle
+class Kept(NamedTuple):
+    """Contacts by pair: a ball fixed to one body against a plane fixed to the other.
+
+    The plane touches the other body's surface where it is nearest to the ball. While the bodies move by a small part
+    of their size it stands for that surface, with an error of the motion squared over the radius of curvature; for
+    flat surfaces and walls it is exact, and a ball that rolls is followed exactly.
+    """
+
+    starts: Whole  # where those of each pair begin, and the end, (p + 1,)
+    features: WholeRows  # side, 0 if the ball is the first body's, else 1, and number of the ball, (c, 2)
+    planes: Rows  # anchor [m] and normal, in the frame of the other, (c, 6)
+    balls: Rows  # centre, in the frame of its body, and radius [m], (c, 4)
+    forces: Rows  # of the last step, in the world [N], (c, 3)
+
+
+@bundle
+class Placed(NamedTuple):
+    """Contacts where bodies are now, (c,)."""
+
+    bodies: WholeRows  # (c, 2)
+    point: Rows  # [m], (c, 3)
+    normal: Rows  # from the second to the first, (c, 3)
+    gap: Numbers  # [m], negative where they overlap
 
 
 @ti.func
@@ -231,29 +278,27 @@ def may_touch(p: Vector3, within: ti.f64, shape: ti.i32, shapes: Shapes) -> bool
     return may
 
 
-@ti.func
-def key_of(first: ti.i32, second: ti.i32, side: ti.i32, feature: ti.i32) -> ti.i64:
-    """As `AnchoredContacts.keys`."""
-    pair = (ti.cast(first, ti.i64) << BODY_BITS) | second
-    return (pair << (FEATURE_BITS + 1)) | (ti.cast(side, ti.i64) << FEATURE_BITS) | feature
+@func
+def is_known(pair: ti.i32, side: ti.i32, feature: ti.i32, near: Near, kept: Kept) -> ti.i32:
+    """The row of a contact of a pair in the step before, or -1."""
+    row, old = -1, near.before[pair]
+    if old >= 0:
+        for known in range(kept.starts[old], kept.starts[old + 1]):
+            if kept.features[known, 0] == side and kept.features[known, 1] == feature:
+                row = known
+    return row
 
 
-@ti.func
-def is_among(key: ti.i64, keys: Keys) -> bool:
-    """Whether a key is among ascending ones; the first of them is none."""
-    low, high = 0, keys.shape[0] - 1
-    while low < high:
-        middle = (low + high + 1) // 2
-        if keys[middle] <= key:
-            low = middle
-        else:
-            high = middle - 1
-    return keys[low] == key
+@func
+def margin_of(first: ti.i32, second: ti.i32, bodies: Bodies) -> ti.f64:
+    """Gap up to which contacts of two bodies are looked for [m]."""
+    smaller = ti.min(bodies.size[first], bodies.size[second])
+    return (CONTACT_BAND + TRUSTED_MOTION) * smaller + bodies.motion[first] + bodies.motion[second]
 
 
-@ti.func
+@func
 def choose_of_patch(
-    begin: ti.i32, end: ti.i32, deepest: ti.i32, first: ti.i32, second: ti.i32, margin: ti.f64, last: Keys, work: Rows
+    begin: ti.i32, end: ti.i32, deepest: ti.i32, pair: ti.i32, margin: ti.f64, near: Near, kept: Kept, work: Rows
 ):
     """Of the candidates of a patch choose the deepest, and those that meet first when it is tilted in 8 directions.
 
@@ -275,8 +320,8 @@ def choose_of_patch(
     for c in range(begin, end):
         if work[c, 17] == IN_PATCH:
             point = vector_at(work, c, 8)
-            key = key_of(first, second, ti.cast(work[c, 15], ti.i32), ti.cast(work[c, 16], ti.i32))
-            bonus = ti.select(is_among(key, last), KEPT_BONUS * extent, 0.0)
+            known = is_known(pair, ti.cast(work[c, 15], ti.i32), ti.cast(work[c, 16], ti.i32), near, kept)
+            bonus = ti.select(known >= 0, KEPT_BONUS * extent, 0.0)
             for d in ti.static(range(8)):
                 along = ti.static(math.cos(_angle(d))) * point.dot(one) + ti.static(math.sin(_angle(d))) * point.dot(
                     two
@@ -302,15 +347,14 @@ def keep_few(
     begin: ti.i32,
     end: ti.i32,
     task: ti.i32,
-    first: ti.i32,
-    second: ti.i32,
     margin: ti.f64,
-    last: Keys,
+    near: Near,
+    kept: Kept,
     work: Rows,
     found: Found,
 ):
     """Note a few of the candidates of a pair: patches of like normals, deepest first, few of each."""
-    kept = 0
+    count = 0
     for _ in range(MOST_PATCHES):
         deepest, least = -1, ti.cast(FAR, ti.f64)
         for c in range(begin, end):
@@ -324,20 +368,20 @@ def keep_few(
                     work[c, 17] = IN_PATCH
                     members += 1
             if members > 2:
-                choose_of_patch(begin, end, deepest, first, second, margin, last, work)
+                choose_of_patch(begin, end, deepest, near.tasks[task], margin, near, kept, work)
             for c in range(begin, end):
                 use = work[c, 17]
                 if use >= IN_PATCH:
                     work[c, 17] = DONE
-                    row = task * MOST_KEPT + kept
+                    row = task * MOST_KEPT + count
                     found.features[row, 0] = ti.cast(work[c, 15], ti.i32)
                     found.features[row, 1] = ti.cast(work[c, 16], ti.i32)
                     found.heights[row] = work[c, 6]
                     for i in ti.static(range(3)):
                         found.planes[row, i] = work[c, i] - work[c, 6] * work[c, 3 + i]
                         found.planes[row, 3 + i] = work[c, 3 + i]
-                    kept += 1
-    found.counts[task] = kept
+                    count += 1
+    found.counts[task] = count
 
 
 @func
@@ -379,12 +423,13 @@ def add_candidate(
     work[end, 15], work[end, 16], work[end, 17] = side, feature, FREE
 
 
-@kernel_of_host_arrays
+@kernel
 def find_contacts(
-    tasks: Tasks,
+    count: ti.i32,
     bodies: Bodies,
+    near: Near,
+    kept: Kept,
     walls: Rows,
-    last: Keys,
     shapes: Shapes,
     room: ti.i32,
     blocks: ti.i32,
@@ -392,13 +437,14 @@ def find_contacts(
     work: Rows,
     found: Found,
 ):
-    """Contacts of each pair by the balls of each against the distance of the other.
+    """Contacts of each pair that is examined by the balls of each against the distance of the other.
 
     Args:
-        tasks: the pairs.
+        count: of these pairs; those that are polytopes are left out.
         bodies: where they are.
+        near: the pairs.
+        kept: the contacts of the step before.
         walls: axis, side, offset, corners of the rectangle on the two other axes, (w, 7).
-        last: ascending keys of the contacts of the last step, -1 first.
         shapes: of the bodies.
         room: most balls of a pair.
         blocks: of pairs, which are looked at one after the other in each.
@@ -409,15 +455,16 @@ def find_contacts(
     for item in range(blocks * run):
         block = item // run
         begin = block * room
-        task = ti.select(item % run == 0, block, found.counts.shape[0])
-        while task < found.counts.shape[0]:
+        task = ti.select(item % run == 0, block, count)
+        while task < count:
+            pair = near.tasks[task]
             first, second, wall, sides = (
-                tasks.pairs[task, 0],
-                tasks.pairs[task, 1],
-                tasks.pairs[task, 2],
-                tasks.pairs[task, 3],
+                near.pairs[pair, 0],
+                near.pairs[pair, 1],
+                near.pairs[pair, 2],
+                near.pairs[pair, 3],
             )
-            margin, end = tasks.margins[task], begin
+            margin, end = margin_of(first, second, bodies), begin
             for side in range(2):
                 owner, other = ti.select(side == 0, first, second), ti.select(side == 0, second, first)
                 clusters_of_owner = 0
@@ -469,5 +516,183 @@ def find_contacts(
                             feature = number + (ti.max(wall, 0) << (FEATURE_BITS - WALL_BITS))
                             add_candidate(end, side, other, feature, radius, centre, outward, distance, bodies, work)
                             end += 1
-            keep_few(begin, end, task, first, second, margin, last, work, found)
+            if sides > 0:
+                found.clearances[task] = margin
+                keep_few(begin, end, task, margin, near, kept, work, found)
+                for row in range(task * MOST_KEPT, task * MOST_KEPT + found.counts[task]):
+                    owner = ti.select(found.features[row, 0] == 0, first, second)
+                    number = found.features[row, 1] & ((1 << (FEATURE_BITS - WALL_BITS)) - 1)
+                    ball = shapes.whole[bodies.shape[owner], FIRST_BALL] + number
+                    for column in ti.static(range(4)):
+                        found.balls[row, column] = shapes.balls[ball, column]
             task += blocks
+
+
+@kernel
+def place_boxes(bodies: Bodies, count: ti.i32, outer: Rows) -> ti.i32:
+    """Axis-aligned boxes of so many bodies; how many of these, with what they may reach, have left larger ones, (b, 6).
+
+    What they may reach is what `margin_of` has of them.
+    """
+    for body in range(count):
+        middle = turned(bodies.pose, body, vector_at(bodies.rest_box, body, 0)) + vector_at(bodies.pose, body, 0)
+        for row in ti.static(range(3)):
+            half = ti.cast(0.0, ti.f64)
+            for column in ti.static(range(3)):
+                half += ti.abs(bodies.pose[body, 3 + 3 * row + column]) * bodies.rest_box[body, 3 + column]
+            bodies.box[body, row], bodies.box[body, 3 + row] = middle[row] - half, middle[row] + half
+    left = 0
+    for body in range(count):
+        reach = (CONTACT_BAND + TRUSTED_MOTION) * bodies.size[body] + bodies.motion[body]
+        is_outside = False
+        for axis in ti.static(range(3)):
+            is_outside |= bodies.box[body, axis] - reach < outer[body, axis]
+            is_outside |= bodies.box[body, 3 + axis] + reach > outer[body, 3 + axis]
+        if is_outside:
+            left += 1
+    return left
+
+
+@func
+def is_near(first: ti.i32, second: ti.i32, wall: ti.i32, bodies: Bodies, walls: Rows) -> bool:
+    """Whether the boxes of two bodies, or that of one and a wall that it is before, are within their margin."""
+    apart, may = -ti.cast(FAR, ti.f64), True
+    if wall < 0:
+        for axis in ti.static(range(3)):
+            apart = ti.max(apart, bodies.box[first, axis] - bodies.box[second, 3 + axis])
+            apart = ti.max(apart, bodies.box[second, axis] - bodies.box[first, 3 + axis])
+    else:
+        for axis in ti.static(range(3)):
+            if ti.cast(walls[wall, 0], ti.i32) == axis:
+                side, offset = walls[wall, 1], walls[wall, 2]
+                apart = ti.select(side > 0.0, bodies.box[first, axis] - offset, offset - bodies.box[first, 3 + axis])
+                may = side * (bodies.pose[first, axis] - offset) > 0.0  # a body that left by an open face falls on
+    return may and apart <= margin_of(first, second, bodies)
+
+
+@kernel
+def choose_pairs(count: ti.i32, bodies: Bodies, near: Near, walls: Rows) -> ti.i32:
+    """What happens to the contacts of each of so many pairs; how many are to be examined.
+
+    Those of no active body stay, those that are no longer near go, and those that moved too far are looked at again.
+    """
+    for pair in range(count):
+        first, second = near.pairs[pair, 0], near.pairs[pair, 1]
+        budget = near.budget[pair] - bodies.moved[first] - bodies.moved[second]
+        action = ti.select(budget > -0.5 * FAR, KEPT, DROPPED)
+        if bodies.is_active[first] == 1 or bodies.is_active[second] == 1:
+            if not is_near(first, second, near.pairs[pair, 2], bodies, walls):
+                action, budget = DROPPED, -ti.cast(FAR, ti.f64)
+            elif bodies.motion[first] + bodies.motion[second] > budget:
+                action = EXAMINED
+        near.budget[pair], near.action[pair] = budget, action
+        near.numbers[pair] = ti.cast(action == EXAMINED, ti.i32)
+    total = scan_in_parallel(near.numbers, count, near.sums, near.place)
+    for pair in range(count):
+        if near.action[pair] == EXAMINED:
+            near.tasks[near.place[pair]] = pair
+    return total
+
+
+@kernel
+def count_contacts(count: ti.i32, bodies: Bodies, near: Near, found: Found, before: Kept, kept: Kept) -> ti.i32:
+    """Where the contacts of each of so many pairs will stand, and how many there are of all."""
+    for pair in range(count):
+        number, old = 0, near.before[pair]
+        if near.action[pair] == EXAMINED:
+            task = near.place[pair]
+            smaller = ti.min(bodies.size[near.pairs[pair, 0]], bodies.size[near.pairs[pair, 1]])
+            number, near.budget[pair] = found.counts[task], found.clearances[task] - CONTACT_BAND * smaller
+        elif near.action[pair] == KEPT and old >= 0:
+            number = before.starts[old + 1] - before.starts[old]
+        near.numbers[pair] = number
+    return scan_in_parallel(near.numbers, count, near.sums, kept.starts)
+
+
+@kernel
+def place_contacts(
+    count: ti.i32, bodies: Bodies, near: Near, found: Found, before: Kept, kept: Kept, placed: Placed
+) -> ti.i64:
+    """Put the contacts of so many pairs in their places, with their forces if they were there, and find where they are.
+
+    Only what `kept` has of `starts` is read, the rest is written, as `placed` is. Returns the deepest overlap [nm].
+    """
+    deepest = ti.cast(0, ti.i64)
+    for pair in range(count):
+        first, second, old = near.pairs[pair, 0], near.pairs[pair, 1], near.before[pair]
+        is_examined = near.action[pair] == EXAMINED
+        depth = ti.cast(0.0, ti.f64)
+        for row in range(kept.starts[pair], kept.starts[pair + 1]):
+            number = row - kept.starts[pair]
+            if is_examined:
+                source = near.place[pair] * MOST_KEPT + number
+                known = is_known(pair, found.features[source, 0], found.features[source, 1], near, before)
+                for column in ti.static(range(2)):
+                    kept.features[row, column] = found.features[source, column]
+                for column in ti.static(range(6)):
+                    kept.planes[row, column] = found.planes[source, column]
+                for column in ti.static(range(4)):
+                    kept.balls[row, column] = found.balls[source, column]
+                for column in ti.static(range(3)):
+                    kept.forces[row, column] = 0.0
+                    if known >= 0:
+                        kept.forces[row, column] = before.forces[known, column]
+            else:
+                source = before.starts[old] + number
+                for column in ti.static(range(2)):
+                    kept.features[row, column] = before.features[source, column]
+                for column in ti.static(range(6)):
+                    kept.planes[row, column] = before.planes[source, column]
+                for column in ti.static(range(4)):
+                    kept.balls[row, column] = before.balls[source, column]
+                for column in ti.static(range(3)):
+                    kept.forces[row, column] = before.forces[source, column]
+            side = kept.features[row, 0]
+            owner, other = ti.select(side == 0, first, second), ti.select(side == 0, second, first)
+            outward = turned(bodies.pose, other, vector_at(kept.planes, row, 3))
+            anchor = turned(bodies.pose, other, vector_at(kept.planes, row, 0)) + vector_at(bodies.pose, other, 0)
+            centre = turned(bodies.pose, owner, vector_at(kept.balls, row, 0)) + vector_at(bodies.pose, owner, 0)
+            placed.bodies[row, 0], placed.bodies[row, 1] = first, second
+            gap = outward.dot(centre - anchor) - kept.balls[row, 3]
+            placed.gap[row] = gap
+            if bodies.is_active[first] == 1 or bodies.is_active[second] == 1:
+                depth = ti.max(depth, -gap)
+            for axis in ti.static(range(3)):
+                placed.point[row, axis] = centre[axis] - kept.balls[row, 3] * outward[axis]
+                placed.normal[row, axis] = ti.select(side == 0, outward[axis], -outward[axis])
+        if depth > 0.0:
+            ti.atomic_max(deepest, ti.cast(ti.min(1.0e9 * depth, 1.0e18), ti.i64))
+    return deepest
+
+
+@kernel_of_host_arrays
+def overlapping_boxes(
+    boxes: Rows,
+    axis: ti.i32,
+    order: Whole,
+    moves: Whole,
+    fills: ti.i32,
+    numbers: Whole,
+    starts: Whole,
+    pairs: WholeRows,
+):
+    """Count, or write from `starts` on, for each place in the order of lower corners the boxes that it overlaps.
+
+    Of two the one that comes first in order has the pair. One of both moves.
+    """
+    for place in range(order.shape[0]):
+        one, count, other_place = order[place], 0, place + 1
+        while other_place < order.shape[0]:
+            two = order[other_place]
+            if boxes[two, axis] > boxes[one, 3 + axis]:
+                break
+            overlap = moves[one] == 1 or moves[two] == 1
+            for side in ti.static(range(3)):
+                overlap &= boxes[one, side] <= boxes[two, 3 + side] and boxes[two, side] <= boxes[one, 3 + side]
+            if overlap:
+                if fills == 1:
+                    pairs[starts[place] + count, 0] = ti.min(one, two)
+                    pairs[starts[place] + count, 1] = ti.max(one, two)
+                count += 1
+            other_place += 1
+        numbers[place] = count

@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
-from taichi.lang.util import to_taichi_type
 
 from sim.rigid import collision_kernels as kernels
 from sim.rigid.contacts import FEATURE_BITS, WALL_BITS, Array, Indices
 from sim.rigid.polytope_kernels import Polytopes
 from sim.rigid.polytopes import Polytope, polytope_of
+from sim.rigid.tables import kept
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 from sim.shapes.revolved import Revolved
@@ -38,7 +37,7 @@ class CollisionShapes:
 
     Attributes:
         of_body: number of the shape of each body, (b,) int32.
-        tables: what `find_contacts` reads, in the host's memory; `on_device` in the device's, which keeps it.
+        on_device: what `find_contacts` reads, in the device's memory, which keeps it.
         most_balls: of a shape.
         polytopes: those shapes that are, on the device.
         most_vertices: of one of them.
@@ -77,33 +76,39 @@ class CollisionShapes:
             row[kernels.FIRST_CLUSTER], row[kernels.CLUSTERS] = sum(map(len, clusters)), len(groups)
             balls.append(own)
             clusters.append(groups)
-        self.tables = kernels.Shapes(
-            whole, sizes, *(np.concatenate(parts) for parts in (balls, clusters, values, edges))
-        )
-        self.on_device = kernels.Shapes(*map(_kept, self.tables))
+        tables = (whole, sizes, *(np.concatenate(parts) for parts in (balls, clusters, values, edges)))
+        self.on_device = kernels.Shapes(*map(kept, tables))
         self.most_balls = int(whole[:, kernels.BALLS].max())
         if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
             raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
         found = [polytope_of(geometry) for geometry in shapes]
         self._is_polytope = np.array([each is not None for each in found])
-        self.polytopes = Polytopes(*map(_kept, _tables_of(found)))
+        self.polytopes = Polytopes(*map(kept, _tables_of(found)))
         self.most_vertices = max((len(each.vertices) for each in found if each is not None), default=0)
-        self._sides = np.array([[_sides(one, two) for two in shapes] for one in shapes], dtype=np.int32)
+        sides = np.array([[_sides(one, two) for two in shapes] for one in shapes], dtype=np.int32)
+        self._sides = np.where(self._is_polytope[:, None] & self._is_polytope, 0, sides)
+
+    @property
+    def has_polytopes(self) -> bool:
+        """Whether there is one."""
+        return bool(self._is_polytope.any())
+
+    @property
+    def has_others(self) -> bool:
+        """Whether there is another shape."""
+        return not self._is_polytope.all()
 
     def sides(self, first: Indices, second: Indices) -> NDArray[np.int32]:
-        """Whose balls are to be looked at in pairs of bodies: 1 the first's, 2 the second's, 3 both, (k,)."""
+        """Whose balls are to be looked at in pairs of bodies: 1 the first's, 2 the second's, 3 both, (k,).
+
+        0 where both are polytopes.
+        """
         return self._sides[self.of_body[first], self.of_body[second]]
 
-    def are_polytopes(self, bodies: Indices) -> NDArray[np.bool_]:
-        """Whether bodies are, (k,)."""
-        result: NDArray[np.bool_] = self._is_polytope[self.of_body[bodies]]
+    def sides_at_wall(self, bodies: Indices) -> NDArray[np.int32]:
+        """Likewise of bodies and walls, (k,)."""
+        result: NDArray[np.int32] = np.where(self._is_polytope[self.of_body[bodies]], 0, 1)
         return result
-
-    def balls_of(self, body: Indices, feature: Indices) -> Array:
-        """The balls that contacts name: centre, radius, axis, cone, (k, 8)."""
-        number = feature & ((1 << (FEATURE_BITS - WALL_BITS)) - 1)
-        found: Array = self.tables.balls[self.tables.whole[self.of_body[body], kernels.FIRST_BALL] + number]
-        return found
 
 
 def _tables_of(shapes: Sequence[Polytope | None]) -> Polytopes:
@@ -126,13 +131,6 @@ def _tables_of(shapes: Sequence[Polytope | None]) -> Polytopes:
         np.concatenate([loops, np.zeros((1, 2), dtype=np.int64)]).astype(np.int32),
         corners.astype(np.int32),
     )
-
-
-def _kept(numbers: NDArray[np.generic]) -> ti.Ndarray:
-    """An array of these numbers, of their type, on the device."""
-    array = ti.ndarray(to_taichi_type(numbers.dtype), numbers.shape)
-    array.from_numpy(numbers)
-    return array
 
 
 def _sides(one: BodyGeometry, two: BodyGeometry) -> int:

@@ -7,6 +7,7 @@ import taichi as ti
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
 from sim.rigid.joint_kernels import JointRows, Velocities, relax_joints
+from sim.rigid.joint_system import UNBOUNDED
 
 Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
 Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
@@ -19,11 +20,12 @@ FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its lim
 
 
 NORMAL, TANGENT, ARM, OWN = 0, 3, 9, 15
-LEAST, LOWEST, FRICTION, BODY, IMPULSE, BEFORE, AHEAD = 21, 22, 23, 24, 26, 29, 32
-"""Columns of what a contact is while its island is solved: arms and bodies are two, tangents of three numbers too."""
-COLUMNS = 35
+LEAST, LOWEST, FRICTION, IMPULSE, CHANGE, AHEAD = 21, 22, 23, 24, 27, 30
+"""Columns of what a contact is while its island is solved: arms are two, tangents of three numbers too."""
+COLUMNS = 33
 Work = ti.types.ndarray(dtype=ti.types.vector(COLUMNS, ti.f64), ndim=1)
 Eases = ti.types.ndarray(dtype=ti.types.vector(7, ti.f64), ndim=1)
+Ahead = ti.types.ndarray(dtype=ti.types.vector(12, ti.f64), ndim=1)
 
 
 @bundle
@@ -34,10 +36,47 @@ class System(NamedTuple):
     point: Rows  # [m], (c, 3)
     normal: Rows  # from the second to the first, (c, 3)
     least: Numbers  # bounds of the normal velocities from below [m/s]
-    lowest: Numbers  # bounds of the normal impulses from below [N s]
     friction: Numbers  # coefficients mu [-]
     position: Rows  # centres of mass [m], (n, 3)
     ease: Eases  # inverse mass [1/kg] and inertia xx, xy, xz, yy, yz, zz in world axes [1/(kg m²)], (n,)
+
+
+@bundle
+class Islands(NamedTuple):
+    """Contacts, pairs of bodies and bodies of islands, island after island; contacts of a pair stand together."""
+
+    order: Whole  # contacts, (c,)
+    spans: Whole  # where those of each pair begin in `order`, and the end, (p + 1,)
+    first: Whole  # first pair of each island, and the end, (i + 1,)
+    movers: Whole  # bodies that impulses move, (m,)
+    first_mover: Whole  # of each island, and the end, (i + 1,)
+    most_sweeps: Whole  # after which an island is given up, (i,)
+
+
+@bundle
+class Overlaps(NamedTuple):
+    """What moves bodies apart in a step, (c,)."""
+
+    gap: Numbers  # [m]
+    rate: ti.f64  # at which overlaps shrink, 0 for nothing of the kind [1/s]
+    slop: ti.f64  # overlap that stays [m]
+    dt: ti.f64  # [s]
+    is_placed: Whole  # 1 where the contact is brought to where its bounce leads to by the end of the step
+    rest: Numbers  # time from the bounce to the end of the step [s]
+    fall: Numbers  # velocity that gravity adds in that time along the normal [m/s]
+
+
+@bundle
+class Outcomes(NamedTuple):
+    """What is found."""
+
+    impulses: Rows  # to start from, and found, in world axes [N s], (c, 3)
+    velocity: Velocities  # of bodies without impulses, and with them [m/s], [rad/s], (n,)
+    along_normal: Numbers  # relative velocities [m/s], (c,)
+    extra: Velocities  # that only moves bodies apart [m/s], [rad/s], (n,)
+    sweeps: Pairs  # that each island took in both solves, one more than the most where it was given up, (i, 2)
+    work: Work  # what contacts are, (c,)
+    ahead: Ahead  # of bodies: velocities before a sweep, and directions of what goes on, (n,)
 
 
 @ti.func
@@ -47,40 +86,26 @@ def vector_of(table: ti.template(), row: ti.i32, column: ti.i32) -> Vector3:
 
 
 @ti.func
-def turned_by(ease: Eases, body: ti.i32, torque: Vector3) -> Vector3:
-    """Change of a body's angular velocity by an angular impulse."""
-    xx, xy, xz = ease[body][1], ease[body][2], ease[body][3]
-    yy, yz, zz = ease[body][4], ease[body][5], ease[body][6]
+def row_of(rows: ti.template(), row: ti.i32) -> Vector3:
+    """Three numbers of a table of three columns."""
+    return Vector3(rows[row, 0], rows[row, 1], rows[row, 2])
+
+
+@ti.func
+def tensor_times(ease: ti.template(), torque: Vector3) -> Vector3:
+    """Change of the angular velocity of a body of this ease by an angular impulse."""
     return Vector3(
-        xx * torque[0] + xy * torque[1] + xz * torque[2],
-        xy * torque[0] + yy * torque[1] + yz * torque[2],
-        xz * torque[0] + yz * torque[1] + zz * torque[2],
+        ease[1] * torque[0] + ease[2] * torque[1] + ease[3] * torque[2],
+        ease[2] * torque[0] + ease[4] * torque[1] + ease[5] * torque[2],
+        ease[3] * torque[0] + ease[5] * torque[1] + ease[6] * torque[2],
     )
 
 
 @ti.func
-def velocity_at(at: ti.i32, work: Work, velocity: Velocities) -> Vector3:
-    """The relative velocity of the bodies at a contact."""
-    relative = Vector3(0.0)
-    for side in ti.static(range(2)):
-        body = ti.cast(work[at][BODY + side], ti.i32)
-        arm = vector_of(work, at, ARM + 3 * side)
-        own = vector_of(velocity, body, 0) + vector_of(velocity, body, 3).cross(arm)
-        relative += own if ti.static(side == 0) else -own
-    return relative
-
-
-@ti.func
-def push(at: ti.i32, impulse: Vector3, work: Work, ease: Eases, velocity: Velocities):
-    """Give the bodies of a contact an impulse."""
-    for side in ti.static(range(2)):
-        body = ti.cast(work[at][BODY + side], ti.i32)
-        if ease[body][0] > 0.0:
-            own = impulse if ti.static(side == 0) else -impulse
-            turn = turned_by(ease, body, vector_of(work, at, ARM + 3 * side).cross(own))
-            for axis in ti.static(range(3)):
-                velocity[body][axis] += ease[body][0] * own[axis]
-                velocity[body][3 + axis] += turn[axis]
+def velocity_at(at: ti.i32, one: ti.i32, two: ti.i32, work: Work, velocity: Velocities) -> Vector3:
+    """The relative velocity of two bodies at a contact."""
+    result = vector_of(velocity, one, 0) + vector_of(velocity, one, 3).cross(vector_of(work, at, ARM))
+    return result - vector_of(velocity, two, 0) - vector_of(velocity, two, 3).cross(vector_of(work, at, ARM + 3))
 
 
 @ti.func
@@ -103,40 +128,46 @@ def tangents_of(n: Vector3):
 
 
 @func
-def gather(at: ti.i32, i: ti.i32, system: System, impulses: Rows, work: Work):
-    """Put together what a contact is, its own block of A among it: nn, n1, n2, 11, 12, 22.
+def gather_contact(
+    at: ti.i32,
+    normal: Vector3,
+    arm_one: Vector3,
+    arm_two: Vector3,
+    start: Vector3,
+    friction: ti.f64,
+    least: ti.f64,
+    one: ti.i32,
+    two: ti.i32,
+    ease: Eases,
+    work: Work,
+):
+    """Put together what a contact of two bodies is, its own block of A among it: nn, n1, n2, 11, 12, 22.
 
-    Impulses to start from push, and stay within friction.
+    Impulses to start from, in world axes, push, and stay within friction.
     """
-    normal = Vector3(system.normal[i, 0], system.normal[i, 1], system.normal[i, 2])
-    one, two = tangents_of(normal)
-    start = Vector3(impulses[i, 0], impulses[i, 1], impulses[i, 2])
-    along = Vector3(ti.max(start.dot(normal), 0.0), start.dot(one), start.dot(two))
-    rubbing, limit = ti.sqrt(along[1] * along[1] + along[2] * along[2]), system.friction[i] * along[0]
+    first, second = tangents_of(normal)
+    along = Vector3(ti.max(start.dot(normal), 0.0), start.dot(first), start.dot(second))
+    rubbing, limit = ti.sqrt(along[1] * along[1] + along[2] * along[2]), friction * along[0]
     if rubbing > limit:
         along[1] *= limit / rubbing
         along[2] *= limit / rubbing
     for axis in ti.static(range(3)):
-        work[at][NORMAL + axis], work[at][TANGENT + axis], work[at][TANGENT + 3 + axis] = (
-            normal[axis],
-            one[axis],
-            two[axis],
-        )
-        work[at][IMPULSE + axis], work[at][AHEAD + axis] = along[axis], 0.0
-    work[at][LEAST], work[at][LOWEST], work[at][FRICTION] = system.least[i], system.lowest[i], system.friction[i]
+        work[at][NORMAL + axis], work[at][TANGENT + axis] = normal[axis], first[axis]
+        work[at][TANGENT + 3 + axis] = second[axis]
+        work[at][ARM + axis], work[at][ARM + 3 + axis] = arm_one[axis], arm_two[axis]
+        work[at][IMPULSE + axis], work[at][CHANGE + axis], work[at][AHEAD + axis] = along[axis], 0.0, 0.0
+    work[at][LEAST], work[at][LOWEST], work[at][FRICTION] = least, 0.0, friction
     block = ti.Vector.zero(ti.f64, 6)
     for side in ti.static(range(2)):
-        body = system.bodies[i, side]
-        work[at][BODY + side] = body
-        for axis in ti.static(range(3)):
-            work[at][ARM + 3 * side + axis] = system.point[i, axis] - system.position[body, axis]
-        if system.ease[body][0] > 0.0:
-            arm = vector_of(work, at, ARM + 3 * side)
+        body = one if ti.static(side == 0) else two
+        if ease[body][0] > 0.0:
+            arm = arm_one if ti.static(side == 0) else arm_two
             for row in ti.static(range(3)):
-                axis = vector_of(work, at, NORMAL + 3 * row)
-                answer = system.ease[body][0] * axis + turned_by(system.ease, body, arm.cross(axis)).cross(arm)
+                axis = normal if ti.static(row == 0) else (first if ti.static(row == 1) else second)
+                answer = ease[body][0] * axis + tensor_times(ease[body], arm.cross(axis)).cross(arm)
                 for column in ti.static(range(row, 3)):
-                    block[ti.static(entry_of(row, column))] += answer.dot(vector_of(work, at, NORMAL + 3 * column))
+                    other = normal if ti.static(column == 0) else (first if ti.static(column == 1) else second)
+                    block[ti.static(entry_of(row, column))] += answer.dot(other)
     for entry in ti.static(range(6)):
         work[at][OWN + entry] = block[entry]
 
@@ -168,7 +199,11 @@ def friction_impulse(a_11: ti.f64, a_12: ti.f64, a_22: ti.f64, c_1: ti.f64, c_2:
                 break
             # -x·dx/dκ = x·(A + κ)⁻¹x
             fall = (d_22 * x_1 * x_1 - 2.0 * a_12 * x_1 * x_2 + d_11 * x_2 * x_2) / determinant
-            kappa += (ti.sqrt(square) / limit - 1.0) * square / fall
+            before, kappa = kappa, kappa + (ti.sqrt(square) / limit - 1.0) * square / fall
+            if before == 0.0:
+                # From below as well: |x| is at least |c| over κ and the larger eigenvalue of A.
+                spread = ti.sqrt(0.25 * (a_11 - a_22) * (a_11 - a_22) + a_12 * a_12)
+                kappa = ti.max(kappa, ti.sqrt(c_1 * c_1 + c_2 * c_2) / limit - 0.5 * (a_11 + a_22) - spread)
         if not is_found:
             scale = limit / ti.sqrt(square)
             x_1, x_2 = scale * x_1, scale * x_2
@@ -176,167 +211,357 @@ def friction_impulse(a_11: ti.f64, a_12: ti.f64, a_22: ti.f64, c_1: ti.f64, c_2:
 
 
 @func
-def sweep_island(
+def push(body: ti.i32, impulse: Vector3, at: ti.i32, arm: ti.i32, system: System, found: Outcomes):
+    """Give a body of a contact an impulse; its arm begins at some column."""
+    if system.ease[body][0] > 0.0:
+        turn = tensor_times(system.ease[body], vector_of(found.work, at, arm).cross(impulse))
+        for axis in ti.static(range(3)):
+            found.velocity[body][axis] += system.ease[body][0] * impulse[axis]
+            found.velocity[body][3 + axis] += turn[axis]
+
+
+@func
+def relax_pair(
+    rubs: ti.template(),
+    there: bool,
+    ratio: ti.f64,
+    start: ti.i32,
+    stop: ti.i32,
+    one: ti.i32,
+    two: ti.i32,
+    ease: Eases,
+    velocity: Velocities,
+    work: Work,
+):
+    """Change the impulses of all contacts of two bodies one after the other, from the last on where it is not there.
+
+    Before that each goes on along the direction before by a ratio; the velocities, (n,), have done so. Without what
+    rubs there are normal impulses alone.
+
+    Returns:
+        the largest change of a velocity at a contact, and the sum of the squares of the changes of impulses.
+    """
+    largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    ease_one, ease_two = ease[one], ease[two]
+    linear_one, angular_one = vector_of(velocity, one, 0), vector_of(velocity, one, 3)
+    linear_two, angular_two = vector_of(velocity, two, 0), vector_of(velocity, two, 3)
+    for place in range(start, stop):
+        at = ti.select(there, place, start + stop - 1 - place)
+        normal = vector_of(work, at, NORMAL)
+        arm_one, arm_two = vector_of(work, at, ARM), vector_of(work, at, ARM + 3)
+        own = linear_one + angular_one.cross(arm_one) - linear_two - angular_two.cross(arm_two)
+        ahead_n = ratio * work[at][AHEAD]
+        old_n = work[at][IMPULSE] + ahead_n
+        new_n = ti.max(old_n - (own.dot(normal) - work[at][LEAST]) / work[at][OWN], work[at][LOWEST])
+        d_n = new_n - old_n
+        work[at][AHEAD], work[at][CHANGE], work[at][IMPULSE] = ahead_n + work[at][CHANGE], d_n, new_n
+        added = d_n * normal
+        largest = ti.max(largest, work[at][OWN] * ti.abs(d_n))
+        square += d_n * d_n
+        if ti.static(rubs):
+            ahead_1, ahead_2 = ratio * work[at][AHEAD + 1], ratio * work[at][AHEAD + 2]
+            old_1, old_2 = work[at][IMPULSE + 1] + ahead_1, work[at][IMPULSE + 2] + ahead_2
+            d_1, d_2 = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+            if work[at][FRICTION] > 0.0 and (new_n != 0.0 or old_1 != 0.0 or old_2 != 0.0):
+                # Slip without the tangential impulses of this contact.
+                a_11, a_12, a_22 = work[at][OWN + 3], work[at][OWN + 4], work[at][OWN + 5]
+                one_way, other_way = vector_of(work, at, TANGENT), vector_of(work, at, TANGENT + 3)
+                c_1 = own.dot(one_way) + work[at][OWN + 1] * d_n - a_11 * old_1 - a_12 * old_2
+                c_2 = own.dot(other_way) + work[at][OWN + 2] * d_n - a_12 * old_1 - a_22 * old_2
+                new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, work[at][FRICTION] * new_n)
+                d_1, d_2 = new_1 - old_1, new_2 - old_2
+                largest = ti.max(largest, a_11 * ti.abs(d_1), a_22 * ti.abs(d_2))
+                square += d_1 * d_1 + d_2 * d_2
+                added += d_1 * one_way + d_2 * other_way
+            work[at][AHEAD + 1], work[at][AHEAD + 2] = (
+                ahead_1 + work[at][CHANGE + 1],
+                ahead_2 + work[at][CHANGE + 2],
+            )
+            work[at][CHANGE + 1], work[at][CHANGE + 2] = d_1, d_2
+            work[at][IMPULSE + 1], work[at][IMPULSE + 2] = old_1 + d_1, old_2 + d_2
+        linear_one += ease_one[0] * added
+        angular_one += tensor_times(ease_one, arm_one.cross(added))
+        linear_two -= ease_two[0] * added
+        angular_two -= tensor_times(ease_two, arm_two.cross(added))
+    if ease_one[0] > 0.0:
+        for axis in ti.static(range(3)):
+            velocity[one][axis], velocity[one][3 + axis] = linear_one[axis], angular_one[axis]
+    if ease_two[0] > 0.0:
+        for axis in ti.static(range(3)):
+            velocity[two][axis], velocity[two][3 + axis] = linear_two[axis], angular_two[axis]
+    return largest, square
+
+
+@func
+def sweep(
+    rubs: ti.template(),
+    there: bool,
+    ratio: ti.f64,
+    island: ti.i32,
+    islands: Islands,
+    system: System,
+    velocity: Velocities,
+    work: Work,
+):
+    """Change the impulses of all contacts of an island, pair after pair, as `relax_pair` does."""
+    largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    begin, end = islands.first[island], islands.first[island + 1]
+    for step in range(begin, end):
+        pair = ti.select(there, step, begin + end - 1 - step)
+        start, stop = islands.spans[pair], islands.spans[pair + 1]
+        one, two = system.bodies[islands.order[start], 0], system.bodies[islands.order[start], 1]
+        of_velocity, of_impulses = relax_pair(
+            rubs, there, ratio, start, stop, one, two, system.ease, velocity, work
+        )  # fmt: skip
+        largest, square = ti.max(largest, of_velocity), square + of_impulses
+    return largest, square
+
+
+@func
+def relax_contacts(
+    rubs: ti.template(),
     has_joints: ti.template(),
     island: ti.i32,
-    order: Whole,
-    first: Whole,
+    may_change: ti.f64,
+    islands: Islands,
+    system: System,
+    joint_order: ti.template(),
+    joint_first: ti.template(),
+    joints: ti.template(),
+    velocity: Velocities,
+    ahead: Ahead,
+    work: Work,
+) -> ti.i32:
+    """Sweep over an island until a sweep changes no velocity at contacts, or of joints, by more than it may.
+
+    Sweeps are steps of a nonsmooth nonlinear conjugate gradient method (Silcowitz-Hansen, Niebe & Erleben 2010): what a
+    sweep changes is the negative gradient, and from one to the next impulses, and the velocities that belong to them,
+    go on along the direction before, by the ratio of the squares of the gradients; where these grow, it starts anew.
+    Sweeps go there and back: supports are seen from the ground up, and loads from the top down. Joints are solved
+    exactly before each. Returns how many there were, one more than the most where that was not enough.
+    """
+    most = islands.most_sweeps[island]
+    is_settled, taken, ratio, square_before = True, most + 1, ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    first_mover, last_mover = islands.first_mover[island], islands.first_mover[island + 1]
+    for place in range(first_mover, last_mover):
+        for column in ti.static(range(12)):
+            ahead[islands.movers[place]][column] = 0.0
+    for number in range(most):
+        by_joints = ti.cast(0.0, ti.f64)
+        if ti.static(has_joints):
+            for component in range(joint_first[island], joint_first[island + 1]):
+                changed = relax_joints(joint_order[component], joints, velocity)
+                is_settled = is_settled and changed >= 0.0
+                by_joints = ti.max(by_joints, changed)
+        for place in range(first_mover, last_mover):
+            body = islands.movers[place]
+            for column in ti.static(range(6)):
+                ahead[body][column] = velocity[body][column]
+        largest, square = sweep(rubs, number % 2 == 0, ratio, island, islands, system, velocity, work)
+        if ti.max(largest, by_joints) <= may_change:
+            taken = number + 1
+            break
+        ratio = 0.0
+        if 0.0 < square < square_before:
+            ratio = square / square_before
+        square_before = square
+        if number < most - 1:
+            for place in range(first_mover, last_mover):
+                body = islands.movers[place]
+                for column in ti.static(range(6)):
+                    on = ratio * ahead[body][6 + column]
+                    ahead[body][6 + column] = on + velocity[body][column] - ahead[body][column]
+                    velocity[body][column] += on
+    return ti.select(is_settled, taken, most + 1)
+
+
+@ti.func
+def wanted_apart(
+    gap: ti.f64,
+    along_normal: ti.f64,
+    rate: ti.f64,
+    slop: ti.f64,
+    dt: ti.f64,
+    is_placed: bool,
+    rest: ti.f64,
+    fall: ti.f64,
+):
+    """Velocity along the normal that moves a contact apart, or which it may have beside what others do [m/s].
+
+    Overlaps shrink; bounces end where they would have come to; others may close by what velocities leave of their gaps.
+    Arguments are those of `Overlaps`. Returns whether it moves something, too.
+    """
+    depth, room = -gap - slop, ti.max(gap, 0.0)
+    wanted = rate * depth
+    if is_placed:
+        wanted = (rest * (along_normal - 0.5 * fall) - room) / dt - along_normal
+    elif depth <= 0.0:
+        wanted = ti.min(-room / dt - along_normal, 0.0)
+    return wanted, is_placed or depth > 0.0
+
+
+@func
+def solve_island(
+    has_joints: ti.template(),
+    island: ti.i32,
+    islands: Islands,
     system: System,
     joint_order: ti.template(),
     joint_first: ti.template(),
     joints: ti.template(),
     relative_tolerance: ti.f64,
     tolerance: ti.f64,
-    most_sweeps: Whole,
-    impulses: Rows,
-    velocity: Velocities,
-    along_normal: Numbers,
-    work: Work,
-    sweeps: Whole,
+    tolerance_apart: ti.f64,
+    overlaps: Overlaps,
+    found: Outcomes,
 ):
-    """Solve an island until a sweep changes no velocity at contacts, or of joints, by more than a tolerance.
-
-    Sweeps are steps of a nonsmooth nonlinear conjugate gradient method (Silcowitz-Hansen, Niebe & Erleben 2010): what a
-    sweep changes is the negative gradient, and from one to the next the impulses go on along the direction before, by
-    the ratio of the squares of the gradients; where these grow, it starts anew. The last is a mere sweep. Joints are
-    solved exactly before each, and in the end. Arguments are those of the kernels.
-    """
-    begin, end, most = first[island], first[island + 1], most_sweeps[island]
+    """Solve an island for velocities, then for those that move bodies apart; arguments are those of the kernels."""
+    begin, end = islands.spans[islands.first[island]], islands.spans[islands.first[island + 1]]
     may_change = ti.cast(0.0, ti.f64)
-    for at in range(begin, end):
-        gather(at, order[at], system, impulses, work)
-        free = velocity_at(at, work, velocity)
-        may_change = ti.max(may_change, ti.abs(free).max(), ti.abs(work[at][LEAST]))
+    for pair in range(islands.first[island], islands.first[island + 1]):
+        for at in range(islands.spans[pair], islands.spans[pair + 1]):
+            contact = islands.order[at]
+            one, two = system.bodies[contact, 0], system.bodies[contact, 1]
+            point = row_of(system.point, contact)
+            gather_contact(
+                at,
+                row_of(system.normal, contact),
+                point - row_of(system.position, one),
+                point - row_of(system.position, two),
+                row_of(found.impulses, contact),
+                system.friction[contact],
+                system.least[contact],
+                one,
+                two,
+                system.ease,
+                found.work,
+            )
+            free = velocity_at(at, one, two, found.work, found.velocity)
+            may_change = ti.max(may_change, ti.abs(free).max(), ti.abs(system.least[contact]))
     may_change = tolerance + relative_tolerance * may_change
     for at in range(begin, end):
-        push(at, along_axes(at, IMPULSE, work), work, system.ease, velocity)
-    is_settled = True
-    taken, square_before = most + 1, ti.cast(0.0, ti.f64)
-    for sweep in range(most):
-        largest, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        if ti.static(has_joints):
-            for number in range(joint_first[island], joint_first[island + 1]):
-                by_joints = relax_joints(joint_order[number], joints, velocity)
-                is_settled = is_settled and by_joints >= 0.0
-                largest = ti.max(largest, by_joints)
-        for step in range(begin, end):
-            # There and back: supports are seen from the ground up, and loads from the top down.
-            at = ti.select(sweep % 2 == 0, step, begin + end - 1 - step)
-            old_n, old_1, old_2 = work[at][IMPULSE], work[at][IMPULSE + 1], work[at][IMPULSE + 2]
-            work[at][BEFORE], work[at][BEFORE + 1], work[at][BEFORE + 2] = old_n, old_1, old_2
-            own = velocity_at(at, work, velocity)
-            w_n = own.dot(vector_of(work, at, NORMAL)) - work[at][LEAST]
-            new_n = ti.max(old_n - w_n / work[at][OWN], work[at][LOWEST])
-            if new_n != 0.0 or old_n != 0.0 or old_1 != 0.0 or old_2 != 0.0:
-                d_n, d_1, d_2 = new_n - old_n, ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-                largest = ti.max(largest, work[at][OWN] * ti.abs(d_n))
-                if work[at][FRICTION] > 0.0:
-                    # Slip without the tangential impulses of this contact.
-                    a_11, a_12, a_22 = work[at][OWN + 3], work[at][OWN + 4], work[at][OWN + 5]
-                    c_1 = own.dot(vector_of(work, at, TANGENT))
-                    c_2 = own.dot(vector_of(work, at, TANGENT + 3))
-                    c_1 += work[at][OWN + 1] * d_n - a_11 * old_1 - a_12 * old_2
-                    c_2 += work[at][OWN + 2] * d_n - a_12 * old_1 - a_22 * old_2
-                    new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, work[at][FRICTION] * new_n)
-                    d_1, d_2 = new_1 - old_1, new_2 - old_2
-                    work[at][IMPULSE + 1], work[at][IMPULSE + 2] = new_1, new_2
-                    largest = ti.max(largest, a_11 * ti.abs(d_1), a_22 * ti.abs(d_2))
-                work[at][IMPULSE] = new_n
-                added = d_n * vector_of(work, at, NORMAL)
-                added += d_1 * vector_of(work, at, TANGENT) + d_2 * vector_of(work, at, TANGENT + 3)
-                push(at, added, work, system.ease, velocity)
-                square += d_n * d_n + d_1 * d_1 + d_2 * d_2
-        if largest <= may_change:
-            taken = sweep + 1
-            break
-        ratio = ti.cast(0.0, ti.f64)
-        if 0.0 < square < square_before:
-            ratio = square / square_before
-        square_before = square
-        if sweep < most - 1:
-            for at in range(begin, end):
-                is_ahead = False
-                for row in ti.static(range(3)):
-                    ahead = ratio * work[at][AHEAD + row]
-                    work[at][AHEAD + row] = ahead + work[at][IMPULSE + row] - work[at][BEFORE + row]
-                    work[at][IMPULSE + row] += ahead
-                    work[at][BEFORE + row] = ahead
-                    is_ahead |= ahead != 0.0
-                if is_ahead:
-                    push(at, along_axes(at, BEFORE, work), work, system.ease, velocity)
+        contact = islands.order[at]
+        impulse = along_axes(at, IMPULSE, found.work)
+        for side in ti.static(range(2)):
+            body = system.bodies[contact, side]
+            push(body, ti.select(side == 0, impulse, -impulse), at, ARM + 3 * side, system, found)
+    taken = relax_contacts(
+        True, has_joints, island, may_change, islands, system, joint_order, joint_first, joints,
+        found.velocity, found.ahead, found.work,
+    )  # fmt: skip
     if ti.static(has_joints):
-        for number in range(joint_first[island], joint_first[island + 1]):
-            is_settled = is_settled and relax_joints(joint_order[number], joints, velocity) >= 0.0
+        is_settled = True
+        for component in range(joint_first[island], joint_first[island + 1]):
+            is_settled = is_settled and relax_joints(joint_order[component], joints, found.velocity) >= 0.0
+        taken = ti.select(is_settled, taken, islands.most_sweeps[island] + 1)
+    found.sweeps[island, 0], found.sweeps[island, 1] = taken, 0
+    may_change, moves_apart = ti.cast(0.0, ti.f64), False
     for at in range(begin, end):
-        found = along_axes(at, IMPULSE, work)
+        contact = islands.order[at]
+        one, two = system.bodies[contact, 0], system.bodies[contact, 1]
+        impulse = along_axes(at, IMPULSE, found.work)
+        along_normal = velocity_at(at, one, two, found.work, found.velocity).dot(vector_of(found.work, at, NORMAL))
         for axis in ti.static(range(3)):
-            impulses[order[at], axis] = found[axis]
-        along_normal[order[at]] = velocity_at(at, work, velocity).dot(vector_of(work, at, NORMAL))
-    sweeps[island] = ti.select(is_settled, taken, most + 1)
-
-
-@kernel_of_host_arrays
-def sweep_islands(
-    order: Whole,
-    first: Whole,
-    system: System,
-    relative_tolerance: ti.f64,
-    tolerance: ti.f64,
-    most_sweeps: Whole,
-    impulses: Rows,
-    velocity: Velocities,
-    along_normal: Numbers,
-    work: Work,
-    sweeps: Whole,
-):
-    """Solve every island of contacts.
-
-    Args:
-        order: contacts, island after island, (k,).
-        first: where each island begins in `order`, and the end of the last, (islands + 1,).
-        system: the contacts.
-        relative_tolerance: part of the largest velocity at contacts of the island without impulses that may change.
-        tolerance: what may change besides [m/s].
-        most_sweeps: after which an island is given up, (islands,).
-        impulses: to start from, and found, in world axes [N s], (c, 3).
-        velocity: of the bodies without impulses, and with them [m/s], [rad/s], (n,).
-        along_normal: out: relative velocity along the normals [m/s], (c,).
-        work: room for what contacts are, (k,).
-        sweeps: out: how many each island took, one more than the most where it was given up, (islands,).
-    """
-    for island in range(first.shape[0] - 1):
-        sweep_island(
-            False, island, order, first, system, order, first, system,
-            relative_tolerance, tolerance, most_sweeps, impulses, velocity, along_normal, work, sweeps,
+            found.impulses[contact, axis] = impulse[axis]
+        found.along_normal[contact] = along_normal
+        is_placed = overlaps.is_placed[contact] == 1
+        wanted, asks = wanted_apart(
+            overlaps.gap[contact], along_normal, overlaps.rate, overlaps.slop, overlaps.dt,
+            is_placed, overlaps.rest[contact], overlaps.fall[contact],
+        )  # fmt: skip
+        moves_apart = moves_apart or asks
+        may_change = ti.max(may_change, tolerance_apart * ti.abs(wanted))
+        found.work[at][LEAST] = wanted
+        found.work[at][LOWEST] = ti.select(is_placed, -ti.cast(UNBOUNDED, ti.f64), 0.0)
+        found.work[at][IMPULSE], found.work[at][CHANGE], found.work[at][AHEAD] = 0.0, 0.0, 0.0
+    if moves_apart and overlaps.rate > 0.0:
+        found.sweeps[island, 1] = relax_contacts(
+            False, False, island, may_change, islands, system, joint_order, joint_first, joints,
+            found.extra, found.ahead, found.work,
         )  # fmt: skip
 
 
 @kernel_of_host_arrays
-def sweep_jointed_islands(
-    order: Whole,
-    first: Whole,
+def solve_islands(
+    islands: Islands,
+    system: System,
+    relative_tolerance: ti.f64,
+    tolerance: ti.f64,
+    tolerance_apart: ti.f64,
+    overlaps: Overlaps,
+    found: Outcomes,
+):
+    """Solve every island of contacts.
+
+    Args:
+        islands: which contacts, in which order.
+        system: the contacts.
+        relative_tolerance: part of the largest velocity at contacts of the island without impulses that may change.
+        tolerance: what may change besides [m/s].
+        tolerance_apart: part of the largest velocity that is wanted to move bodies apart that may change.
+        overlaps: what moves bodies apart.
+        found: out.
+    """
+    for island in range(islands.most_sweeps.shape[0]):
+        solve_island(
+            False, island, islands, system, islands.order, islands.order, system,
+            relative_tolerance, tolerance, tolerance_apart, overlaps, found,
+        )  # fmt: skip
+
+
+@kernel_of_host_arrays
+def solve_jointed_islands(
+    islands: Islands,
     system: System,
     joint_order: Whole,
     joint_first: Whole,
     joints: JointRows,
     relative_tolerance: ti.f64,
     tolerance: ti.f64,
-    most_sweeps: Whole,
-    impulses: Rows,
-    velocity: Velocities,
-    along_normal: Numbers,
-    work: Work,
-    sweeps: Whole,
+    tolerance_apart: ti.f64,
+    overlaps: Overlaps,
+    found: Outcomes,
 ):
-    """Solve every island of contacts and joints; further arguments as those of `sweep_islands`.
+    """Solve every island of contacts and joints; further arguments as those of `solve_islands`.
 
     Args:
         joint_order: components of joints, island after island.
         joint_first: where those of each island begin, and the end of the last, (islands + 1,).
         joints: their rows, without impulses at first.
     """
-    for island in range(first.shape[0] - 1):
-        sweep_island(
-            True, island, order, first, system, joint_order, joint_first, joints,
-            relative_tolerance, tolerance, most_sweeps, impulses, velocity, along_normal, work, sweeps,
+    for island in range(islands.most_sweeps.shape[0]):
+        solve_island(
+            True, island, islands, system, joint_order, joint_first, joints,
+            relative_tolerance, tolerance, tolerance_apart, overlaps, found,
         )  # fmt: skip
+
+
+@ti.func
+def join(one: ti.i32, two: ti.i32, group: Whole):
+    """Have two bodies be of one group: what belongs to a larger number belongs to the smaller one as well."""
+    larger, smaller = ti.max(one, two), ti.min(one, two)
+    while larger != smaller:
+        before = ti.atomic_min(group[larger], smaller)
+        if before == larger:
+            larger = smaller  # it was the first of its group
+        else:
+            larger, smaller = ti.max(before, smaller), ti.min(before, smaller)
+
+
+@kernel_of_host_arrays
+def join_bodies(bodies: Pairs, links: Pairs, moves: Whole, group: Whole):
+    """Groups of bodies that contacts, (c, 2), and links, (l, 2), hang together by way of bodies that move.
+
+    Args:
+        group: each body's own number, and then the least number of its group, whatever the order of the threads.
+    """
+    for contact in range(bodies.shape[0]):
+        if moves[bodies[contact, 0]] == 1 and moves[bodies[contact, 1]] == 1:
+            join(bodies[contact, 0], bodies[contact, 1], group)
+    for link in range(links.shape[0]):
+        join(links[link, 0], links[link, 1], group)
+    for body in range(group.shape[0]):
+        first = group[body]
+        while group[first] != first:
+            first = group[first]
+        group[body] = first

@@ -8,18 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.core.solver import Arrays
+from sim.core.reductions import runs_on_gpu
+from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import (
+    COARSE_SPEED,
+    COARSE_WORK,
+    FEWEST_ITERATIONS,
+    MAX_ITERATIONS,
     NO_IMPULSES,
     NO_LINKS,
     RELATIVE_TOLERANCE,
+    Apart,
     ContactSystem,
     Solution,
     solve_velocities,
 )
-from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
-from sim.rigid.joint_system import UNBOUNDED, JointDemand, solve_alone
+from sim.rigid.contacts import Array, Contacts, Indices
+from sim.rigid.joint_system import JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
+from sim.rigid.pile import Pile
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
@@ -49,10 +56,10 @@ class Surfaces:
 class Outcome:
     """What the contacts of a step did besides changing velocities."""
 
-    extra_velocity: Array  # added to the velocity in this step's change of poses only [m/s], (n, 3)
-    extra_angular_velocity: Array  # [rad/s], (n, 3)
+    extra: Array  # (v, omega) added in this step's change of poses only [m/s], [rad/s], (n + 1, 6)
     is_touched: NDArray[np.bool_]  # bodies that got an impulse, (n,) bool
     is_held: NDArray[np.bool_]  # bodies that got one from what cannot move, (n,) bool
+    forces: Array | None  # at the contacts, from which the next step starts [N], (k, 3), where they are not kept yet
     iterations: int  # sweeps of the solver
     converged: bool  # whether it converged
     joint_impulses: Array  # of the joints, (r,), if there are any
@@ -62,39 +69,43 @@ class ContactResponse:
     """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
 
     Attributes:
-        last_keys: the contacts of the last step, ascending.
+        in_colours: whether contacts that neither bounce nor have joints beside them are solved by a `Pile`, many side
+            by side: on GPUs, where islands would be solved by a thread each.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
         self._surfaces, self._gravity = surfaces, gravity
-        self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+        self.in_colours: bool | None = None
+        self._pile: Pile | None = None
 
     def resolve(
         self,
-        contacts: Contacts,
+        detector: CollisionDetector,
         bodies: MovingBodies,
         dt: float,
-        is_active: NDArray[np.bool_],
-        inverse_inertia: Array,
+        ease: Array,
         joints: Joints | None = None,
         step: JointStep | None = None,
     ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
-        These are all their contacts; what is known of those of other bodies stays. Inverse inertia tensors are in world
-        axes, (n, 3, 3); joints, with their step, hold where contacts are.
+        A detector has found their contacts. How easily impulses move bodies, and that others do not, is
+        `ContactSystem.ease`; joints, with their step, hold where contacts are.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
         n = len(bodies)
-        if not len(contacts):
-            self._replace(contacts.keys, np.zeros((0, 3)), is_active)
+        if not detector.active_count():
             nobody = np.zeros(n, dtype=bool)
             still = np.zeros(0 if step is None else len(step.values))
-            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), 0, True, still)
-        inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
+            return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still)
+        if self.in_colours is None:
+            self.in_colours = runs_on_gpu()
+        if self.in_colours and step is None and not self._surfaces.restitution.any():
+            return self._resolve_pile(detector, bodies, dt, ease)
+        contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
-        system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links)
+        system = ContactSystem.build(contacts, bodies.position, ease, links)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
         before = np.zeros((n + 1, 6))
@@ -107,36 +118,62 @@ class ContactResponse:
         impacts, bounces = self._bounce(
             contacts, bodies, system, before, friction, restitution, least_normal, dt, of_impacts
         )
-        most = system.most_sweeps(before)
         solution = solve_velocities(
             system,
             impacts.velocity,
             least_normal=least_normal,
             friction=friction,
-            start=self._starting_impulses(contacts, dt),
+            start=dt * contacts.force,
             relative_tolerance=RELATIVE_TOLERANCE,
             tolerance=self._tolerance(dt),
             joints=of_step,
-            most=most,
+            most=system.most_sweeps(before),
+            apart=_separation(contacts, bounces, dt),
         )
-        bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3], solution.velocity[:n, 3:]
-        self._replace(contacts.keys, solution.impulses / dt, is_active)
+        bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3].copy(), solution.velocity[:n, 3:].copy()
 
-        separation = self._separate(contacts, system, bounces, solution.along_normals, dt, most)
         touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
-        pushed = solution.impulses.any(axis=1) | impacts.impulses.any(axis=1)
-        for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
-            touched[np.minimum(body[pushed], n)] = True
-            held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
+        pushed = solution.impulses[:, 0] != 0.0
+        for axis in (1, 2):
+            pushed |= solution.impulses[:, axis] != 0.0
+        pushed |= impacts.impulses.any(axis=1)
+        is_free = np.append(bodies.is_free, False)[system.bodies]
+        for side in range(2):
+            touched[system.bodies[pushed, side]] = True
+            held[system.bodies[pushed & ~is_free[:, 1 - side], side]] = True
         return Outcome(
-            separation.velocity[:n, :3],
-            separation.velocity[:n, 3:],
+            solution.extra,
             touched[:n],
             held[:n],
-            impacts.iterations + solution.iterations + separation.iterations,
-            impacts.converged and solution.converged and separation.converged,
+            solution.impulses / dt,
+            impacts.iterations + solution.iterations,
+            impacts.converged and solution.converged,
             by_joints + impacts.joint_impulses + solution.joint_impulses,
         )
+
+    def _resolve_pile(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Outcome:
+        from sim.rigid.pile_kernels import Limits
+
+        self._pile = self._pile or Pile(detector, len(bodies))
+        n = len(bodies)
+        velocity = np.zeros((n + 1, 6))
+        velocity[:n, :3], velocity[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        limits = Limits(
+            RELATIVE_TOLERANCE,
+            self._tolerance(dt),
+            WEIGHT_TOLERANCE,
+            MAX_ITERATIONS,
+            COARSE_SPEED,
+            COARSE_WORK,
+            FEWEST_ITERATIONS,
+            _rate(dt),
+            SLOP,
+            dt,
+        )
+        velocity, extra = self._pile.solve(ease, velocity, self._surfaces.friction, limits)
+        bodies.velocity, bodies.angular_velocity = velocity[:n, :3].copy(), velocity[:n, 3:].copy()
+        touched = self._pile.touched[:n]
+        return Outcome(extra, touched > 0, touched > 1, None, self._pile.sweeps, self._pile.converged, NO_IMPULSES)
 
     def _bounce(
         self,
@@ -161,7 +198,7 @@ class ContactResponse:
         impulses, bounces = np.zeros((k, 3)), Bounces.none(k)
         by_joints = NO_IMPULSES if joints is None else np.zeros(len(joints.bias))
         if not restitution.any():
-            return Solution(impulses, velocity, np.zeros(k), 0, True, by_joints), bounces
+            return Solution(impulses, velocity, np.zeros_like(velocity), 0, True, by_joints), bounces
         iterations, converged = 0, True
         for rounds in range(MOST_ROUNDS + 1):
             found = Bounces.find(
@@ -195,70 +232,18 @@ class ContactResponse:
             impulses[rows] += solution.impulses
             velocity = solution.velocity
             iterations, converged = iterations + solution.iterations, converged and solution.converged
-        return Solution(impulses, velocity, np.zeros(k), iterations, converged, by_joints), bounces
+        return Solution(impulses, velocity, np.zeros_like(velocity), iterations, converged, by_joints), bounces
 
     def _tolerance(self, dt: float) -> float:
         """What a sweep may still change besides when it is the last [m/s]."""
         return WEIGHT_TOLERANCE * dt * float(np.linalg.norm(self._gravity))
 
-    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """The forces that the next step starts from."""
-        return {"contact_keys": self.last_keys.copy(), "contact_forces": self._forces.copy()}
 
-    def restore(self, arrays: Arrays) -> None:
-        """Continue from a checkpoint. Raises ValueError when an array is missing."""
-        for name in ("contact_keys", "contact_forces"):
-            if name not in arrays:
-                raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
-        keys, forces = np.asarray(arrays["contact_keys"]), np.asarray(arrays["contact_forces"])
-        self._keep(keys.astype(np.int64), forces.astype(np.float64).reshape(-1, 3))
+def _separation(contacts: Contacts, bounces: Bounces, dt: float) -> Apart:
+    """Overlaps shrink, and bounces end where they would have come to."""
+    return Apart(contacts.gap, _rate(dt), SLOP, dt, bounces.is_placed, bounces.rest, bounces.fall, WEIGHT_TOLERANCE)
 
-    def _replace(self, keys: Indices, forces: Array, is_active: NDArray[np.bool_]) -> None:
-        """Keep the forces of the contacts of active bodies, and those that were known of other bodies."""
-        first, second = bodies_of(self.last_keys)
-        among = np.append(is_active, False)
-        stays = ~(among[np.minimum(first, len(is_active))] | among[np.minimum(second, len(is_active))])
-        self._keep(np.concatenate([keys, self.last_keys[stays]]), np.concatenate([forces, self._forces[stays]]))
 
-    def _keep(self, keys: Indices, forces: Array) -> None:
-        order = np.argsort(keys)
-        self.last_keys, self._forces = keys[order], forces[order]
-
-    def _starting_impulses(self, contacts: Contacts, dt: float) -> Array:
-        """The forces at the same contacts in the last step times dt [s], (k, 3)."""
-        if not len(self.last_keys):
-            return np.zeros((len(contacts), 3))
-        rows, is_known = rows_of(contacts.keys, self.last_keys)
-        return np.where(is_known[:, None], dt * self._forces[rows], 0.0)
-
-    def _separate(
-        self,
-        contacts: Contacts,
-        system: ContactSystem,
-        bounces: Bounces,
-        normal_velocity: Array,
-        dt: float,
-        most: NDArray[np.int32],
-    ) -> Solution:
-        """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
-        k, overlap, rest = len(contacts), -contacts.gap - SLOP, np.zeros((len(system.ease), 6))
-        if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
-            return Solution(np.zeros((k, 3)), rest, np.zeros(k), 0, True, NO_IMPULSES)
-        rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
-        # Contacts that do not overlap may close by what the velocities leave of their gaps.
-        wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
-        wanted = np.where(overlap > 0.0, wanted, np.minimum(wanted, 0.0))
-        wanted = np.where(
-            bounces.is_placed, bounces.displacement(normal_velocity, contacts.gap) / dt - normal_velocity, wanted
-        )
-        return solve_velocities(
-            system,
-            rest,
-            least_normal=wanted,
-            friction=np.zeros(k),
-            start=np.zeros((k, 3)),
-            relative_tolerance=WEIGHT_TOLERANCE,
-            tolerance=0.0,
-            lowest=np.where(bounces.is_placed, -UNBOUNDED, 0.0),
-            most=most,
-        )
+def _rate(dt: float) -> float:
+    """At which overlaps shrink [1/s]."""
+    return min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt

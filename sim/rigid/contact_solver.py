@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.rotation import cross
 from sim.rigid.contacts import Array, Contacts, Indices
@@ -16,7 +14,7 @@ from sim.rigid.joint_system import JointDemand
 MAX_ITERATIONS = 100
 NO_LINKS, NO_IMPULSES = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
 COARSE_SPEED = 0.05
-COARSE_WORK, FEWEST_ITERATIONS = 10_000, 10
+COARSE_WORK, FEWEST_ITERATIONS = 15_000, 15
 """Islands whose contacts are faster [m/s], in the mean, get as many sweeps as make so many looks at contacts, or the
 least: what is left of their overlap is far less than they move in the step."""
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
@@ -37,20 +35,17 @@ class ContactSystem:
     position: Array  # of the moving bodies and of one that stands still [m], (n + 1, 3)
     ease: Array  # of these, inverse mass and inertia: xx, xy, xz, yy, yz, zz, (n + 1, 7)
     islands: Indices  # numbers of the groups of contacts that hang together, (k,)
+    island_of_bodies: Indices  # likewise of bodies, -1 of those that no contact, or no impulse, moves, (n + 1,)
     links: Indices  # pairs of bodies that joints link, (l, 2)
 
     @classmethod
-    def build(
-        cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array, links: Indices = NO_LINKS
-    ) -> ContactSystem:
+    def build(cls, contacts: Contacts, position: Array, ease: Array, links: Indices = NO_LINKS) -> ContactSystem:
         """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
         n = len(position)
         bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n).astype(np.int32)
-        ease = np.zeros((n + 1, 7))
-        ease[:n, 0], ease[:n, 1:] = inverse_mass, inverse_inertia.reshape(n, 9)[:, [0, 1, 2, 4, 5, 8]]
         position = np.concatenate([position, np.zeros((1, 3))])
         islands = _islands(bodies, ease[:, 0] > 0.0, links)
-        return cls(contacts.point, contacts.normal, bodies, position, ease, islands, links)
+        return cls(contacts.point, contacts.normal, bodies, position, ease, *islands, links)
 
     @property
     def moves(self) -> NDArray[np.bool_]:
@@ -62,12 +57,15 @@ class ContactSystem:
         """The system of some of the contacts."""
         bodies = self.bodies[rows]
         islands = _islands(bodies, self.ease[:, 0] > 0.0, self.links)
-        return ContactSystem(self.point[rows], self.normal[rows], bodies, self.position, self.ease, islands, self.links)
+        return ContactSystem(
+            self.point[rows], self.normal[rows], bodies, self.position, self.ease, *islands, self.links
+        )
 
     def most_sweeps(self, velocity: Array) -> NDArray[np.int32]:
         """How many sweeps each island is worth, (islands,), with velocities (v, omega) of all bodies, (n + 1, 6)."""
         sizes = np.bincount(self.islands)
-        speed = np.sqrt(np.square(velocity[:, :3]).sum(axis=1))[self.bodies].max(axis=1)
+        speeds = np.sqrt(np.square(velocity[:, :3]).sum(axis=1))[self.bodies]
+        speed = np.maximum(speeds[:, 0], speeds[:, 1])
         is_coarse = np.bincount(self.islands, weights=speed) > COARSE_SPEED * sizes
         fewer = (COARSE_WORK // sizes).clip(FEWEST_ITERATIONS, MAX_ITERATIONS)
         return np.where(is_coarse, fewer, MAX_ITERATIONS).astype(np.int32)
@@ -85,12 +83,26 @@ class ContactSystem:
 
 
 @dataclass(frozen=True, eq=False)
+class Apart:
+    """What moves bodies apart that overlap, and where bounces end, in a step: fields of `contact_kernels.Overlaps`."""
+
+    gap: Array  # [m], (k,)
+    rate: float  # at which overlaps shrink [1/s]
+    slop: float  # overlap that stays [m]
+    dt: float  # [s]
+    is_placed: NDArray[np.bool_]  # contacts that are brought to where their bounce leads to, (k,)
+    rest: Array  # time from the bounce to the end of the step [s], (k,)
+    fall: Array  # velocity that gravity adds in that time along the normal [m/s], (k,)
+    tolerance: float  # largest change in the last sweep, in the largest velocity that is wanted in the island
+
+
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Impulses and how they were found."""
 
     impulses: Array  # [N s], (k, 3)
     velocity: Array  # (v, omega) of all bodies with them [m/s], [rad/s], (n + 1, 6)
-    along_normals: Array  # relative velocities along the normals [m/s], (k,)
+    extra: Array  # likewise, what only moves them apart
     iterations: int  # sweeps over all contacts of the island that took most
     converged: bool  # whether the last sweep changed less than the tolerance, in all islands
     joint_impulses: Array  # those of joints, (r,), or none where these ask nothing
@@ -105,81 +117,109 @@ def solve_velocities(
     start: Array,
     relative_tolerance: float,
     tolerance: float,
-    lowest: Array | None = None,
     most: NDArray[np.int32] | None = None,
     joints: JointDemand | None = None,
+    apart: Apart | None = None,
 ) -> Solution:
-    """Impulses with w_n >= least_normal, λ_n >= lowest, complementary, and Coulomb friction |λ_t| <= mu λ_n.
+    """Impulses with w_n >= least_normal, λ_n >= 0, complementary, and Coulomb friction |λ_t| <= mu λ_n.
 
     Sweeps over contacts, there and back; of each, first the normal impulse, then both tangential ones exactly for that
     normal one (nonsmooth Gauss-Seidel; Jean 1999, "The non-smooth contact dynamics method"): they stop the slip if
     friction is strong enough, else they are as large as it allows, and opposite to the slip that is left.
 
     Args:
-        system: of the contacts.
+        system: of the contacts, those of two bodies one after the other.
         velocity: (v, omega) of all bodies without the impulses of these contacts [m/s], [rad/s], (n + 1, 6).
         least_normal: lower bound of the normal velocities [m/s], (k,).
         friction: coefficients mu [-], (k,).
         start: impulses to start from [N s], (k, 3).
         relative_tolerance: largest change of a contact velocity in the last sweep, in the largest one of the island.
         tolerance: what may change besides [m/s].
-        lowest: lower bounds of the normal impulses [N s], (k,); 0 if omitted.
         most: sweeps of each island, (islands,); if omitted, the most that there are.
         joints: what joints ask, of which those in islands with contacts are solved.
+        apart: what moves bodies apart, in a solve of its own by normal impulses, as many sweeps at most.
     """
-    from sim.rigid.contact_kernels import COLUMNS, System, sweep_islands, sweep_jointed_islands
+    from sim.rigid.contact_kernels import (
+        COLUMNS,
+        Islands,
+        Outcomes,
+        Overlaps,
+        System,
+        solve_islands,
+        solve_jointed_islands,
+    )
     from sim.rigid.joint_kernels import IMPULSE
 
-    k = len(least_normal)
+    k, count = len(least_normal), int(system.islands.max()) + 1
+    most = np.full(count, MAX_ITERATIONS, dtype=np.int32) if most is None else most
+    begins = np.flatnonzero(np.append(True, (system.bodies[1:] != system.bodies[:-1]).any(axis=1)))
+    sizes = np.diff(begins, append=k)
     # By chance, but always the same: along rows of bodies sweeps carry what they leave to one side.
-    order = np.lexsort((np.random.PCG64(0).random_raw(k), system.islands)).astype(np.int32)
-    sizes = np.bincount(system.islands)
-    first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
-    most = np.full(len(sizes), MAX_ITERATIONS, dtype=np.int32) if most is None else most
-    sweeps = np.zeros(len(sizes), dtype=np.int32)
-    lowest = np.zeros(k) if lowest is None else lowest
-    impulses, velocity, along_normals = start.copy(), velocity.copy(), np.empty(k)
-    contacts = System(
-        system.bodies, system.point, system.normal, least_normal, lowest, friction, system.position, system.ease
+    pairs = np.lexsort((np.random.PCG64(0).random_raw(len(begins)), system.islands[begins]))
+    spans = np.append(0, np.cumsum(sizes[pairs]))
+    order = np.repeat(begins[pairs] - spans[:-1], sizes[pairs]) + np.arange(k)
+    movers = np.argsort(system.island_of_bodies, kind="stable")[np.count_nonzero(system.island_of_bodies < 0) :]
+    numbers = np.arange(count + 1)
+    islands = Islands(
+        *(
+            each.astype(np.int32)
+            for each in (
+                order,
+                spans,
+                np.searchsorted(system.islands[begins[pairs]], numbers),
+                movers,
+                np.searchsorted(system.island_of_bodies[movers], numbers),
+                most,
+            )
+        )
     )
-    found = (relative_tolerance, tolerance, most, impulses, velocity, along_normals, np.empty((k, COLUMNS)), sweeps)
+    contacts = System(system.bodies, system.point, system.normal, least_normal, friction, system.position, system.ease)
+    nothing = np.zeros(k)
+    asked = apart or Apart(nothing, 0.0, 0.0, 1.0, np.zeros(k, dtype=bool), nothing, nothing, 0.0)
+    overlaps = Overlaps(
+        asked.gap, asked.rate, asked.slop, asked.dt, asked.is_placed.astype(np.int32), asked.rest, asked.fall
+    )
+    found = Outcomes(
+        start.copy(),
+        velocity.copy(),
+        np.empty(k),
+        np.zeros_like(velocity),
+        np.zeros((count, 2), dtype=np.int32),
+        np.empty((k, COLUMNS)),
+        np.empty((len(velocity), 12)),
+    )
+    limits = (relative_tolerance, tolerance, asked.tolerance, overlaps, found)
     by_joints = NO_IMPULSES
     if joints is None:
-        sweep_islands(order, first, contacts, *found)
+        solve_islands(islands, contacts, *limits)
     else:
         rows = joints.rows()
-        sweep_jointed_islands(order, first, contacts, *_joints_of_islands(system, joints), rows, *found)
+        solve_jointed_islands(islands, contacts, *_joints_of_islands(system, joints), rows, *limits)
         by_joints = rows.numbers[:, IMPULSE].copy()
-    taken = int(sweeps.max())
-    converged = bool(np.all((sweeps <= most) | (most < MAX_ITERATIONS)))
-    return Solution(impulses, velocity, along_normals, min(taken, MAX_ITERATIONS), converged, by_joints)
+    taken = int(np.minimum(found.sweeps, MAX_ITERATIONS).max(axis=0).sum())
+    converged = bool(np.all((found.sweeps <= most[:, None]) | (most[:, None] < MAX_ITERATIONS)))
+    return Solution(found.impulses, found.velocity, found.extra, taken, converged, by_joints)
 
 
-def _islands(bodies: NDArray[np.int32], moves: NDArray[np.bool_], links: Indices) -> Indices:
-    """Numbers of the groups of contacts, (k,), that joints, and bodies, (n + 1,), which impulses move, link."""
+def _islands(bodies: NDArray[np.int32], moves: NDArray[np.bool_], links: Indices) -> tuple[Indices, Indices]:
+    """Numbers of the groups of contacts, (k,), and of bodies, (n + 1,), which impulses move, that joints link too."""
+    from sim.rigid.contact_kernels import join_bodies
+
     first, second = bodies.T
-    group = _groups(bodies, moves, links)
-    return np.unique(group[np.where(moves[first], first, second)], return_inverse=True)[1].astype(np.int64)
-
-
-def _groups(bodies: NDArray[np.int32], moves: NDArray[np.bool_], links: Indices) -> Indices:
-    """Number of the group of each body, (n + 1,), that contacts and joints link."""
-    first, second = np.concatenate([bodies[moves[bodies].all(axis=1)], links]).T
-    shape = (len(moves), len(moves))
-    linked = coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape)
-    return connected_components(linked, directed=False)[1].astype(np.int64)
+    group = np.arange(len(moves), dtype=np.int32)
+    join_bodies(bodies, links.astype(np.int32), moves.astype(np.int32), group)
+    of_contacts = group[np.where(moves[first], first, second)]
+    number = np.full(len(moves), -1)
+    number[of_contacts] = 0
+    number[number == 0] = np.arange(np.count_nonzero(number == 0))
+    return number[of_contacts], np.where(moves, number[group], -1)
 
 
 def _joints_of_islands(system: ContactSystem, joints: JointDemand) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Components of joints, island after island, and where those of each island begin; others are left out."""
-    moves = system.ease[:, 0] > 0.0
-    groups = _groups(system.bodies, moves, system.links)
-    first, second = system.bodies.T
-    island_of = np.full(len(moves), -1)
-    island_of[groups[np.where(moves[first], first, second)]] = system.islands
     elimination, movers = joints.system.elimination, joints.system.movers.max(axis=1)
     island, moved = np.full(len(elimination.components), -1), movers >= 0
-    island[elimination.component[moved]] = island_of[groups[movers[moved]]]
+    island[elimination.component[moved]] = system.island_of_bodies[movers[moved]]
     order = np.argsort(island, kind="stable").astype(np.int32)
     begins = np.searchsorted(island[order], np.arange(int(system.islands.max()) + 2)).astype(np.int32)
     return order, begins

@@ -10,22 +10,23 @@ from typing import NamedTuple
 import taichi as ti
 
 from sim.core.bundles import bundle, func
-from sim.core.launch import kernel_of_host_arrays
+from sim.core.launch import kernel
 from sim.rigid.collision_kernels import (
     FAR,
     MOST_KEPT,
     Bodies,
     Found,
-    Keys,
+    Kept,
+    Near,
     Numbers,
     Rows,
-    Tasks,
     Vector3,
     Whole,
     WholeRows,
     add_candidate,
     beside_wall,
     keep_few,
+    margin_of,
     turned,
     turned_back,
     vector_at,
@@ -351,46 +352,48 @@ def candidates_at_wall(
     return end
 
 
-@kernel_of_host_arrays
+@kernel
 def find_polytope_contacts(
-    tasks: Tasks,
+    count: ti.i32,
     bodies: Bodies,
+    near: Near,
+    kept: Kept,
     walls: Rows,
-    last: Keys,
     polytopes: Polytopes,
     room: ti.i32,
     blocks: ti.i32,
     run: ti.i32,
     work: Rows,
     found: Found,
-    balls: Rows,
 ):
-    """Contacts of pairs of polytopes; arguments as those of `find_contacts`.
+    """Contacts of pairs of polytopes, whose `sides` are 0; arguments as those of `find_contacts`.
 
     Args:
         room: of candidates, and of corners of a face that is cut: a third of the rows of a block.
-        balls: out: centre, in the frame of its body, and radius [m] of the ball of each contact, (t MOST_KEPT, 4).
     """
     for item in range(blocks * run):
         block = item // run
         begin = 3 * room * block
-        task = ti.select(item % run == 0, block, found.counts.shape[0])
-        while task < found.counts.shape[0]:
-            first, second, wall = tasks.pairs[task, 0], tasks.pairs[task, 1], tasks.pairs[task, 2]
-            margin, end = tasks.margins[task], begin
-            if wall >= 0:
-                end = candidates_at_wall(begin, first, second, wall, margin, bodies, walls, polytopes, work)
-            else:
-                end = candidates_of_pair(begin, room, first, second, margin, bodies, polytopes, work, task, found)
-            keep_few(begin, end, task, first, second, margin, last, work, found)
-            for row in range(task * MOST_KEPT, task * MOST_KEPT + found.counts[task]):
-                own, other = first, second
-                if found.features[row, 0] == 1:
-                    own, other = second, first
-                centre = vector_at(found.planes, row, 0) + found.heights[row] * vector_at(found.planes, row, 3)
-                centre = turned(bodies.pose, other, centre) + vector_at(bodies.pose, other, 0)
-                centre = turned_back(bodies.pose, own, centre - vector_at(bodies.pose, own, 0))
-                for axis in ti.static(range(3)):
-                    balls[row, axis] = centre[axis]
-                balls[row, 3] = polytopes.radii[bodies.shape[own]]
+        task = ti.select(item % run == 0, block, count)
+        while task < count:
+            pair = near.tasks[task]
+            if near.pairs[pair, 3] == 0:
+                first, second, wall = near.pairs[pair, 0], near.pairs[pair, 1], near.pairs[pair, 2]
+                margin, end = margin_of(first, second, bodies), begin
+                found.clearances[task] = margin
+                if wall >= 0:
+                    end = candidates_at_wall(begin, first, second, wall, margin, bodies, walls, polytopes, work)
+                else:
+                    end = candidates_of_pair(begin, room, first, second, margin, bodies, polytopes, work, task, found)
+                keep_few(begin, end, task, margin, near, kept, work, found)
+                for row in range(task * MOST_KEPT, task * MOST_KEPT + found.counts[task]):
+                    own, other = first, second
+                    if found.features[row, 0] == 1:
+                        own, other = second, first
+                    centre = vector_at(found.planes, row, 0) + found.heights[row] * vector_at(found.planes, row, 3)
+                    centre = turned(bodies.pose, other, centre) + vector_at(bodies.pose, other, 0)
+                    centre = turned_back(bodies.pose, own, centre - vector_at(bodies.pose, own, 0))
+                    for axis in ti.static(range(3)):
+                        found.balls[row, axis] = centre[axis]
+                    found.balls[row, 3] = polytopes.radii[bodies.shape[own]]
             task += blocks

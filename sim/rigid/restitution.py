@@ -86,10 +86,6 @@ class Bounces:
         """
         return np.where(self.happens, self.fall - share * self.restitution * self.impact, otherwise)
 
-    def displacement(self, normal_velocity: Array, gap: Array) -> Array:
-        """How far contacts move along their normals in the step [m], (k,); gaps are those at its start."""
-        return -np.maximum(gap, 0.0) + self.rest * (normal_velocity - 0.5 * self.fall)
-
 
 def solve_impacts(
     system: ContactSystem,
@@ -161,7 +157,7 @@ def solve_impacts(
     return Solution(
         before + share[islands][:, None] * step,
         compression.velocity + share_of_bodies[:, None] * change_of_bodies,
-        newton.along_normals,
+        np.zeros_like(velocity),
         compression.iterations + newton.iterations,
         compression.converged and newton.converged,
         by_joints,

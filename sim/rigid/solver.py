@@ -23,7 +23,7 @@ from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
-from sim.rigid.states import MovingBodies, rotate_freely
+from sim.rigid.states import MovingBodies
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
 from sim.shapes.body_geometry import BodyGeometry
 
@@ -51,9 +51,9 @@ class RigidSolver:
     State in float64 on the host; contacts are found and solved in kernels, for which `sim.core.runtime.initialize` must
     have run. One substep: gravity, contact impulses from the poses at its start, then the poses. Groups of bodies that
     are too fast for it take several steps of their own, and groups that rest sleep (`steps`).
-    Free flight is exact for constant gravity, and angular momentum is kept to round-off (`rotate_freely`). Impulses of
-    contacts are equal and opposite at one point, so that contacts change neither the linear nor the angular momentum
-    of bodies that nothing else holds.
+    Free flight is exact for constant gravity, and angular momentum is kept to round-off (`states.turned_freely`).
+    Impulses of contacts are equal and opposite at one point, so that contacts change neither the linear nor the angular
+    momentum of bodies that nothing else holds.
 
     Approximate: boxes and convex meshes touch each other and walls as rounded polytopes (`polytopes`), other shapes as
     unions of balls (`balls.Balls`); both round sharp corners by 2 % of the shortest edge; friction
@@ -99,11 +99,13 @@ class RigidSolver:
 
         fixed = _geometries_of(obstacles)
         self._fixed_position, self._fixed_rotation = _poses_of_obstacles(obstacles, fixed)
+        still = np.concatenate([self._fixed_position, self._fixed_rotation.reshape(-1, 9)], axis=1)
+        self._pose = np.concatenate([np.zeros((len(parameters), 12)), still])
         everybody = [*parameters, *obstacles]
         self.all_names = tuple(body.name for body in everybody)
         self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
-        self._detector = CollisionDetector(self.all_geometries, self.walls)
+        self._detector = CollisionDetector(self.all_geometries, self.walls, len(self.solids))
         self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
@@ -127,6 +129,10 @@ class RigidSolver:
             np.concatenate([self.bodies.position, self._fixed_position]),
             np.concatenate([self.bodies.rotation(), self._fixed_rotation]),
         )
+
+    def _poses_described(self) -> Poses:
+        """The same as `MovingBodies.describe` noted it last, without a copy."""
+        return Poses(self._pose[:, :3], self._pose[:, 3:].reshape(-1, 3, 3))
 
     def mobility(self) -> tuple[Array, Array]:
         """How easily impulses move bodies: inverse masses [1/kg], (n,), and inertia tensors in world axes, (n, 3, 3).
@@ -190,26 +196,29 @@ class RigidSolver:
         moves = is_active | ~bodies.is_dynamic
         reach = self._with_obstacles(np.where(moves, dt * self._surface_speeds(), 0.0))
         among = np.append(is_active, np.zeros(len(self._fixed_position) - 1, dtype=bool))
-        contacts = self._detector.find(self.poses(), reach, self._response.last_keys, among)
-        inverse_inertia, joints = bodies.inverse_inertia(), self.joints
-        step = None if joints is None else joints.begin(bodies, dt, is_active, inverse_inertia)
-        outcome = self._response.resolve(contacts, bodies, dt, is_active, inverse_inertia, joints, step)
-        self._contact_count = len(contacts)
+        ease = np.zeros((len(bodies) + 1, 7))
+        bodies.describe(is_active, self._pose, ease)
+        joints = self.joints
+        self._detector.find(self._poses_described(), reach, among)
+        step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
+        outcome = self._response.resolve(self._detector, bodies, dt, ease, joints, step)
+        if outcome.forces is not None:
+            self._detector.keep_forces(outcome.forces)
+        self._contact_count = self._detector.active_count()
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
-        self._max_penetration = max(self._max_penetration, -float(np.min(contacts.gap, initial=0.0)))
+        self._max_penetration = max(self._max_penetration, self._detector.deepest)
 
         is_touched = outcome.is_touched | (bodies.is_pushed & is_active)
         hold = None
         if joints is not None and step is not None:
-            extra = np.concatenate([outcome.extra_velocity, outcome.extra_angular_velocity], axis=1)
             hold = joints.hold(
                 step,
                 bodies,
                 outcome.joint_impulses,
                 is_touched,
                 gravity=self.gravity,
-                extra=extra,
+                extra=outcome.extra[:-1],
                 is_held=outcome.is_held,
             )
             if hold.is_too_long and halvings > 0:
@@ -219,22 +228,11 @@ class RigidSolver:
                     self._advance(0.5 * dt, time_s + half * 0.5 * dt, is_active, halvings - 1)
                 return
 
-        # A body in free flight moves by the mean of its velocities, which is exact; one in contact by the new one,
-        # which is what the contacts allow, and so does one that a fluid pushed: the fluid is to see how it moves.
-        flying = free & ~is_touched[:, None]
+        # One that a fluid pushed is touched as well: the fluid is to see how it moves.
         bodies.is_pushed = bodies.is_pushed & ~is_active
-        velocity = bodies.velocity - np.where(flying, 0.5 * dt * self.gravity, 0.0)
-        bodies.position = bodies.position + dt * np.where(free, velocity + outcome.extra_velocity, 0.0)
-        spin = bodies.angular_momentum()
-        if outcome.extra_angular_velocity.any():
-            turn = rotation.exponential(dt * outcome.extra_angular_velocity)
-            turned = rotation.product(turn, bodies.orientation)
-            bodies.orientation = np.where(free, rotation.normalized(turned), bodies.orientation)
-            # Bodies that are alone keep their spin. Beside what cannot move, which takes any, it turns with the body:
-            # that keeps the energy.
-            spin = np.where(outcome.is_held[:, None], rotation.rotated(turn, spin), spin)
-        bodies.set_angular_momentum(spin, is_active)
-        rotate_freely(bodies, dt, is_active)
+        bodies.fly_on(
+            dt, self.gravity, outcome.extra, is_active=is_active, is_touched=is_touched, is_held=outcome.is_held
+        )
         self._place_kinematic_bodies(time_s + dt)
         self._detector.follow(self._with_obstacles(self._surface_motion_since(*before)))
         if joints is not None and hold is not None:
@@ -425,7 +423,6 @@ class RigidSolver:
         return {
             **{name: getattr(self.bodies, name).copy() for name in _STATE},
             **self._detector.checkpoint(),
-            **self._response.checkpoint(),
             **({} if self.joints is None else self.joints.checkpoint()),
             "clock": np.array([self.time_s]),
         }
@@ -438,7 +435,6 @@ class RigidSolver:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}, got {found}")
         self._detector.restore(arrays)
-        self._response.restore(arrays)
         if self.joints is not None:
             self.joints.restore(arrays)
             self._obey_joints()

@@ -11,10 +11,8 @@ from sim.core.motion import rotation
 from sim.core.motion.rotation import Array
 from sim.core.snapshots import Snapshot
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.state_kernels import SEQUENCE, Moving, describe, fly_on
 from sim.shapes.placement import SharedShapes, build_solid
-
-_SEQUENCE = ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
-"""Principal axes and shares of the step; the same forwards and backwards, hence second order and reversible."""
 
 _COMPONENTS = ([1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0])
 _SIGNS = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]])
@@ -99,6 +97,40 @@ class MovingBodies:
         inverse = np.einsum("nij,njk,nlk->nil", turned, self._inverse_tensor, turned)
         return np.where(self.is_free[:, None, None], inverse, 0.0)
 
+    def _moving(self) -> Moving:
+        """The bodies as kernels take them, which change these very arrays."""
+        for name in ("position", "orientation", "velocity", "angular_velocity"):
+            setattr(self, name, np.ascontiguousarray(getattr(self, name)))
+        return Moving(
+            self.position,
+            self.orientation,
+            self.velocity,
+            self.angular_velocity,
+            self.inverse_mass,
+            self._tensor,
+            self._inverse_tensor,
+            self.principal_moments,
+            self.principal_orientation,
+        )
+
+    def describe(self, is_active: NDArray[np.bool_], pose: Array, ease: Array) -> None:
+        """Note where bodies are and how easily impulses move active ones; see `state_kernels.describe`."""
+        describe(self._moving(), (self.is_free & is_active).astype(np.int32), pose, ease)
+
+    def fly_on(
+        self,
+        dt: float,
+        gravity: Array,
+        extra: Array,
+        *,
+        is_active: NDArray[np.bool_],
+        is_touched: NDArray[np.bool_],
+        is_held: NDArray[np.bool_],
+    ) -> None:
+        """Move and turn active bodies for dt [s]; see `state_kernels.fly_on`."""
+        which = (each.astype(np.int32) for each in (is_active, is_touched, is_held))
+        fly_on(self._moving(), dt, 0.5 * dt * gravity[None], extra, *which)
+
     def angular_momentum(self) -> Array:
         """Spin I omega about the centres of mass in world axes [kg m²/s], (n, 3); means nothing if kinematic."""
         turned = self.rotation()
@@ -140,30 +172,21 @@ class MovingBodies:
         self.angular_velocity = self.angular_velocity + np.einsum("nij,nj->ni", self.inverse_inertia(), angular)
 
 
-def rotate_freely(bodies: MovingBodies, dt: float, which: NDArray[np.bool_]) -> None:
-    """Turn bodies, (n,), by I domega/dt = -omega x (I omega) for dt [s].
-
-    Strang splitting of the Euler equations into rotations about the principal axes (Dullweber, Leimkuhler & McLachlan
-    1997, "Symplectic splitting methods for rigid body molecular dynamics"; McLachlan 1993). Every part is solved as a
-    rotation, so that |L| is exact; as the method is symplectic, the energy oscillates by O((omega dt)²) without drift.
-    The spin in world axes is carried over as it is; the angular velocity follows from it.
-    """
-    spin = bodies.angular_momentum()
-    q = turned_freely(bodies.orientation, bodies.principal_orientation, bodies.principal_moments, spin, dt)
-    bodies.orientation = np.where(which[:, None], q, bodies.orientation)
-    bodies.set_angular_momentum(spin, which)
-
-
 def turned_freely(
     orientation: Array, principal_orientation: Array, principal_moments: Array, spin: Array, dt: float
 ) -> Array:
     """Orientations, (n, 4), after dt [s] without torque, of bodies with spins in world axes [kg m²/s], (n, 3).
 
+    Strang splitting of the Euler equations, I domega/dt = -omega x (I omega), into rotations about the principal axes
+    (Dullweber, Leimkuhler & McLachlan 1997, "Symplectic splitting methods for rigid body molecular dynamics"; McLachlan
+    1993). Every part is solved as a rotation, so that the spin is exact; as the method is symplectic, the energy
+    oscillates by O((omega dt)²) without drift.
+
     The principal axes are given in body axes, (n, 4), with their moments [kg m²], (n, 3).
     """
     q = rotation.product(orientation, principal_orientation)
     in_body = np.einsum("nji,nj->in", rotation.matrices(q), spin)
-    for axis, share in _SEQUENCE:
+    for axis, share in SEQUENCE:
         angle = share * dt * in_body[axis] / principal_moments[:, axis]
         c, s = np.cos(0.5 * angle), np.sin(0.5 * angle)
         q = c[:, None] * q + s[:, None] * (_SIGNS[axis] * q[:, _COMPONENTS[axis]])

@@ -12,8 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
-from sim.rigid.broad_phase import NearBoxes
-from sim.rigid.collision import CONTACT_BAND, TRUSTED_MOTION, CollisionDetector
+from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Array, Indices
 from sim.rigid.states import MovingBodies
 from sim.shapes.body_geometry import BodyGeometry
@@ -58,7 +57,6 @@ class StepChooser:
         self._radius = np.array([geometry.radius for geometry in geometries])
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
-        self._boxes = NearBoxes()
         self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
         self.links = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
@@ -68,13 +66,10 @@ class StepChooser:
         acceleration = float(np.linalg.norm(self._gravity))
         spin = np.sqrt(np.square(bodies.angular_velocity).sum(axis=1))
         own = bodies.surface_speeds(self._radius[:n])
-        motion = np.zeros(len(self._edge))
+        motion = np.zeros(len(self._edge) + 1)
         motion[:n] = (own if speeds is None else speeds) * dt + 0.5 * acceleration * dt * dt
-        reach = (motion + (CONTACT_BAND + TRUSTED_MOTION) * self._edge)[:, None]
-        lower, upper = self._detector.boxes(poses)
         among = np.append(is_active, np.zeros(len(self._edge) - n, dtype=bool))
-        boxes = self._boxes.overlapping(lower - reach, upper + reach, motion, among)
-        first, second = self._detector.touching(*boxes)
+        first, second = self._detector.overlapping(poses, motion, among)
 
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
         turning = np.append(spin, np.zeros(len(self._edge) - n)) * self._radius
@@ -122,6 +117,8 @@ class StepChooser:
             return []
         if self.needs_none(dt):
             return [(1, is_free)]
+        if self._is_calm(poses, dt, is_free):
+            return [(1, is_free)]
         groups, counts = self._counts(self.meetings(poses, dt, is_active), dt, is_free)
         speeds = bodies.surface_speeds(self._radius[: len(bodies)])
         fastest = np.zeros(len(bodies))
@@ -130,6 +127,36 @@ class StepChooser:
         if np.any(faster > speeds):
             _, counts = self._counts(self.meetings(poses, dt, is_active, faster), dt, is_free)
         return [(int(count), is_free & (counts == count)) for count in np.unique(counts[is_free])]
+
+    def _is_calm(self, poses: Poses, dt: float, is_free: NDArray[np.bool_]) -> bool:
+        """Whether no free body may get too far in dt [s]: a look from above at what `meetings` finds exactly."""
+        from sim.rigid.step_kernels import Speeds, count_fast
+
+        bodies, n = self._bodies, len(self._bodies)
+        acceleration = float(np.linalg.norm(self._gravity))
+        spin = np.sqrt(np.square(bodies.angular_velocity).sum(axis=1))
+        if float(np.max(spin, where=is_free, initial=0.0)) * dt > LARGEST_TURN:
+            return False
+        still = len(self._edge) + 1 - n
+        own = bodies.surface_speeds(self._radius[:n])
+        motion = np.append(own * dt + 0.5 * acceleration * dt * dt, np.zeros(still))
+        self._detector.look(poses, motion)
+        speeds = Speeds(
+            np.concatenate([bodies.velocity, np.zeros((still, 3))]),
+            np.append(spin * self._radius[:n], np.zeros(still)),
+            np.append(own, np.zeros(still)),
+            np.append(self._advance, FAR),
+            np.append(is_free, np.zeros(still)).astype(np.int32),
+            np.append(self._radius, 0.0),
+        )
+        near, _, moving, _ = self._detector.on_device()
+        if not self._detector.pair_count:
+            return True
+        fast = np.zeros(1, dtype=np.int32)
+        count_fast(
+            self._detector.pair_count, near.pairs, moving.pose, self._detector.walls, speeds, dt, acceleration, fast
+        )
+        return not fast[0]
 
     def _counts(self, meetings: Meetings, dt: float, is_free: NDArray[np.bool_]) -> tuple[Indices, Indices]:
         """The group of each body, and how many steps it takes in dt [s], (n,) each."""

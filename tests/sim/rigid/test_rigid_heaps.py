@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from rigid_scenes import advance, ball, body, energy, in_room, in_space
+from rigid_scenes import advance, ball, body, cube, energy, in_room, in_space
 
+from sim.core.domain import DomainParameters
 from sim.rigid.solver import SLEEP_TIME_S, RigidSolver
 
 
@@ -82,6 +83,43 @@ def test_a_high_wall_of_bricks_does_not_tremble_either():
     """Of 199, whose solves end before they have converged: what is left must not add up, nor contacts take turns."""
     solver = brick_wall(10, 19)
     assert max(run(solver, 0.1)) < 1e-3
+
+
+def pyramid(layers: int) -> RigidSolver:
+    """Boxes in square layers, a millimetre apart, and a heavy ball that flies into their middle."""
+    edge, pitch = 0.1, 0.101
+    boxes = [
+        body(
+            f"box{layer}_{row}_{column}",
+            cube(edge),
+            (pitch * (row - 0.5 * (size - 1)), pitch * (column - 0.5 * (size - 1)), (layer + 0.5) * edge),
+            friction=0.5,
+        )
+        for layer, size in enumerate(range(layers, 0, -1))
+        for row in range(size)
+        for column in range(size)
+    ]
+    away = 0.5 * pitch * layers
+    hit = body("hit", ball(0.15), (-away - 0.5, 0.0, 0.2 * layers * edge + 0.15), velocity=(6.0, 0, 0), density=3000.0)
+    hall = DomainParameters(min=(-4.0 * away, -3.0 * away, 0.0), max=(5.0 * away, 3.0 * away, 4.0))
+    return in_room(*boxes, hit, domain=hall)
+
+
+def test_a_pyramid_falls_when_it_is_hit_and_comes_to_rest():
+    solver = pyramid(4)
+    start = solver.bodies.position.copy()
+    run(solver, 0.05)
+    boxes = slice(0, -1)
+    assert np.linalg.norm(solver.bodies.position - start, axis=1)[boxes].max() < 1e-4  # it stands until then
+    run(solver, 3.0)
+    moved = np.linalg.norm(solver.bodies.position - start, axis=1)[boxes]
+    assert np.count_nonzero(moved > 0.05) >= len(moved) // 2
+    assert start[boxes, 2].mean() - solver.bodies.position[boxes, 2].mean() > 0.02
+    assert solver.bodies.is_asleep[boxes].all()
+    solver.bodies.wake(np.ones(len(start), dtype=bool))
+    run(solver, 0.05)
+    assert solver.diagnostics()["max_penetration"] < 1e-4  # a thousandth of an edge
+    assert solver.bodies.position[boxes, 2].min() > 0.049
 
 
 def test_hulls_in_a_bowl_come_to_rest_without_sinking_in(tmp_path):
