@@ -98,7 +98,7 @@ def test_a_high_wall_of_bricks_does_not_tremble_either():
 
 
 def pyramid(layers: int) -> RigidSolver:
-    """Boxes in square layers, a millimetre apart, and a heavy block that flies into their middle."""
+    """Boxes in square layers, a millimetre apart, and a heavy block that flies into their upper half."""
     edge, pitch = 0.1, 0.101
     boxes = [
         body(
@@ -112,7 +112,7 @@ def pyramid(layers: int) -> RigidSolver:
         for column in range(size)
     ]
     away = 0.5 * pitch * layers
-    place = (-away - 0.5, 0.0, 0.2 * layers * edge + 0.15)
+    place = (-away - 0.3, 0.0, 0.5 * layers * edge + 0.15)
     hit = body("hit", cube(0.25), place, velocity=(6.0, 0, 0), density=3000.0, friction=0.5)
     hall = DomainParameters(min=(-4.0 * away, -3.0 * away, 0.0), max=(5.0 * away, 3.0 * away, 4.0))
     return in_room(*boxes, hit, domain=hall)
@@ -126,7 +126,7 @@ def test_a_pyramid_falls_when_it_is_hit_and_comes_to_rest():
     assert np.linalg.norm(solver.bodies.position - start, axis=1)[boxes].max() < 1e-4  # it stands until then
     run(solver, 3.0)
     moved = np.linalg.norm(solver.bodies.position - start, axis=1)[boxes]
-    assert np.count_nonzero(moved > 0.05) >= len(moved) // 2
+    assert np.count_nonzero(moved > 0.2) >= 5  # those of the upper two layers
     assert start[boxes, 2].mean() - solver.bodies.position[boxes, 2].mean() > 0.02
     assert solver.bodies.is_asleep.all()
     solver.bodies.wake(np.ones(len(start), dtype=bool))
