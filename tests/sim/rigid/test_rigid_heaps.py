@@ -121,7 +121,7 @@ def pyramid(layers: int) -> RigidSolver:
 def test_a_pyramid_falls_when_it_is_hit_and_comes_to_rest():
     solver = pyramid(4)
     start = solver.bodies.position.copy()
-    run(solver, 0.05)
+    run(solver, 0.03)
     boxes = slice(0, -1)
     assert np.linalg.norm(solver.bodies.position - start, axis=1)[boxes].max() < 1e-4  # it stands until then
     run(solver, 3.0)
