@@ -208,15 +208,6 @@ class CollisionDetector:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
         self._moved = self._moved + motion
 
-    def near(self) -> tuple[Indices, Indices]:
-        """The pairs of bodies that were near in the last step, (p,) each; the domain is one."""
-        if not len(self._pairs):
-            nothing = np.zeros(0, dtype=np.int64)
-            return nothing, nothing
-        is_near = viewed(self._near.action)[: len(self._pairs)] != kernels.DROPPED
-        first, second = self._pairs[is_near, :2].astype(np.int64).T
-        return first, second
-
     def overlapping(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> tuple[Indices, Indices]:
         """Pairs of bodies whose boxes overlap with what surfaces may reach, and that may touch, (p,) each.
 
