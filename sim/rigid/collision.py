@@ -88,7 +88,8 @@ class CollisionDetector:
         return {
             "near_pairs": self._pairs.copy(),
             "near_budgets": self._budgets(),
-            "near_boxes": self._outer.copy(),
+            # Boxes that are to be searched anew lie in none.
+            "near_boxes": np.full_like(self._outer, kernels.FAR) if self._must_search else self._outer.copy(),
             "near_motion": self._moved.copy(),
             "contact_starts": self._starts().copy(),
             **{

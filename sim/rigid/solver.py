@@ -436,10 +436,10 @@ class RigidSolver:
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}, got {found}")
-        self._detector.restore(arrays)
         if self.joints is not None:
             self.joints.restore(arrays)
             self._obey_joints()
+        self._detector.restore(arrays)
         for name in _STATE:
             setattr(self.bodies, name, np.array(arrays[name], dtype=getattr(self.bodies, name).dtype))
         self.time_s = float(arrays["clock"][0])
