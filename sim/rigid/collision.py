@@ -35,6 +35,7 @@ class CollisionDetector:
     Attributes:
         followed: the contacts that are being followed, by pair.
         untouching: keys of pairs of bodies that do not touch each other, as joints hold them, ascending.
+        time_s: at which shapes that deform are looked at [s].
 
     Raises:
         ValueError: there are too many bodies for the keys of contacts.
@@ -52,7 +53,8 @@ class CollisionDetector:
         self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.followed = AnchoredContacts.joined([])
         self._boxes = NearBoxes()
-        self.untouching = np.zeros(0, dtype=np.int64)
+        self.untouching, self.time_s = np.zeros(0, dtype=np.int64), 0.0
+        self._deforms = np.array([*(geometry.deformation is not None for geometry in geometries), False])
 
     def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
         """Those of some pairs of bodies, the lower number first, that may touch, (p,) each."""
@@ -100,7 +102,9 @@ class CollisionDetector:
         if len(self._pairs):
             rows, is_known = rows_of(pairs, self._pairs)
             budget[is_known] = self._budget[rows[is_known]]
-        is_stale = ahead > budget
+        # What is fixed to a body is not to what deforms.
+        deforms = self._deforms[pairs >> BODY_BITS] | self._deforms[pairs & ((1 << BODY_BITS) - 1)]
+        is_stale = (ahead > budget) | deforms
 
         # What no active body belongs to stays as it is.
         asleep = ~self._is_of(self._pairs, is_active)
@@ -108,6 +112,8 @@ class CollisionDetector:
         owned = pair_keys(self.followed.first, self.followed.second)
         kept = self.followed.chosen(np.flatnonzero(np.isin(owned, stays)))
         tasks = np.flatnonzero(is_stale[of_task])
+        if deforms.any():
+            self._shapes.deform(self.time_s)
         found, clearance = self._examine(first[tasks], second[tasks], wall[tasks], poses, motion, last)
         clear = np.full(len(pairs), np.inf)
         np.minimum.at(clear, of_task[tasks], clearance - CONTACT_BAND * self._smaller(first[tasks], second[tasks]))

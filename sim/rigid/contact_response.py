@@ -12,7 +12,9 @@ from sim.core.solver import Arrays
 from sim.rigid.contact_solver import (
     NO_IMPULSES,
     NO_LINKS,
+    NOT_CARRIED,
     RELATIVE_TOLERANCE,
+    Carried,
     ContactSystem,
     Solution,
     solve_velocities,
@@ -78,11 +80,12 @@ class ContactResponse:
         inverse_inertia: Array,
         joints: Joints | None = None,
         step: JointStep | None = None,
+        carried: Carried = NOT_CARRIED,
     ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
         These are all their contacts; what is known of those of other bodies stays. Inverse inertia tensors are in world
-        axes, (n, 3, 3); joints, with their step, hold where contacts are.
+        axes, (n, 3, 3); joints, with their step, hold where contacts are; some contacts are carried by surfaces.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
@@ -94,11 +97,11 @@ class ContactResponse:
             return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), 0, True, still)
         inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
         links = NO_LINKS if step is None else step.system.links()
-        system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links)
+        system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links, carried)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
-        before = np.zeros((n + 1, 6))
-        before[:n, :3], before[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        before = np.zeros((len(system.ease), 6))
+        before[:n, :3], before[:n, 3:], before[n + 1 :, :3] = bodies.velocity, bodies.angular_velocity, carried.velocity
         of_impacts, of_step, by_joints = None, None, NO_IMPULSES
         if joints is not None and step is not None:
             of_impacts, of_step = joints.impacts(step), joints.velocities(step)

@@ -18,7 +18,8 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
-from sim.rigid.contacts import Indices
+from sim.rigid.contact_solver import NOT_CARRIED, Carried
+from sim.rigid.contacts import Contacts, Indices
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
@@ -70,6 +71,7 @@ class RigidSolver:
         surfaces: friction and restitution of all of these.
         walls: closed faces of the domain.
         joints: between the bodies, or None.
+        deforming: deformations of the bodies that have one, by their number.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
         has_own_steps: whether fast bodies divide the step of all; nothing that is coupled to them shares it then.
 
@@ -95,6 +97,9 @@ class RigidSolver:
         self.bodies = _starting_bodies(parameters, self.solids)
         self._groups = tuple(body.group for body in parameters)
         self._centres = np.array([solid.centre_of_mass for solid in self.solids])
+        self.deforming = {
+            number: solid.deformation for number, solid in enumerate(self.solids) if solid.deformation is not None
+        }
         self._place_kinematic_bodies(0.0)
 
         fixed = _geometries_of(obstacles)
@@ -190,10 +195,12 @@ class RigidSolver:
         moves = is_active | ~bodies.is_dynamic
         reach = self._with_obstacles(np.where(moves, dt * self._surface_speeds(), 0.0))
         among = np.append(is_active, np.zeros(len(self._fixed_position) - 1, dtype=bool))
+        self._detector.time_s = time_s
         contacts = self._detector.find(self.poses(), reach, self._response.last_keys, among)
+        carried = self._carried(contacts, time_s + 0.5 * dt)
         inverse_inertia, joints = bodies.inverse_inertia(), self.joints
         step = None if joints is None else joints.begin(bodies, dt, is_active, inverse_inertia)
-        outcome = self._response.resolve(contacts, bodies, dt, is_active, inverse_inertia, joints, step)
+        outcome = self._response.resolve(contacts, bodies, dt, is_active, inverse_inertia, joints, step, carried)
         self._contact_count = len(contacts)
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
@@ -236,12 +243,29 @@ class RigidSolver:
         bodies.set_angular_momentum(spin, is_active)
         rotate_freely(bodies, dt, is_active)
         self._place_kinematic_bodies(time_s + dt)
-        self._detector.follow(self._with_obstacles(self._surface_motion_since(*before)))
+        self._detector.follow(self._with_obstacles(self._surface_motion_since(*before) + dt * bodies.deforming))
         if joints is not None and hold is not None:
             broken = int(joints.is_broken.sum())
             joints.settle(hold, bodies, is_active, bodies.inverse_inertia())
             if int(joints.is_broken.sum()) > broken:
                 self._obey_joints()
+
+    def _carried(self, contacts: Contacts, time_s: float) -> Carried:
+        """The sides of contacts that are on surfaces that deform, with their velocities at a time [s]."""
+        found = []
+        for number, deformation in self.deforming.items():
+            if self.bodies.deforming[number] == 0.0:
+                continue
+            turned, velocity = rotation.matrices(self.bodies.orientation[number]), self.bodies.velocity[number]
+            for side, own in enumerate((contacts.first, contacts.second)):
+                rows = np.flatnonzero(own == number)
+                if not len(rows):
+                    continue
+                arm = contacts.point[rows] - self.bodies.position[number]
+                of_surface = deformation.velocities(arm @ turned + self._centres[number], time_s) @ turned.T
+                led = velocity + rotation.cross(self.bodies.angular_velocity[number], arm) + of_surface
+                found.append((rows, np.full(len(rows), side), led))
+        return Carried(*map(np.concatenate, zip(*found, strict=True))) if found else NOT_CARRIED
 
     def _obey_joints(self) -> None:
         """Tell who looks for contacts, and who chooses steps, what joints hold together now."""
@@ -303,6 +327,8 @@ class RigidSolver:
         number = self.bodies.names.index(name) if name in self.bodies.names else -1
         if number not in self.paths:
             raise ValueError(f'no kinematic body is named "{name}"; only such bodies can be led')
+        if number in self.deforming:
+            raise ValueError(f'"{name}" deforms as its file has it, by time alone; nothing else can lead it')
         now = self.paths[number].at(self.time_s)
         self.paths[number] = path_onwards(now, self.time_s, position, rotation_deg, within_s)
         self._place_kinematic_bodies(self.time_s)  # couplings see how it moves from now on
@@ -369,6 +395,8 @@ class RigidSolver:
             self.bodies.orientation[number] = motion.orientation
             self.bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
             self.bodies.angular_velocity[number] = motion.angular_velocity
+        for number, deformation in self.deforming.items():
+            self.bodies.deforming[number] = deformation.speed(time_s)
 
     def _set_mean_velocities_of_kinematic_bodies(self, time_s: float, dt: float) -> None:
         """Contacts see how kinematic bodies will have moved by the end of the step of dt [s] from a time [s] on."""
@@ -499,7 +527,8 @@ class RigidSolver:
 
 def largest_dt(parameters: Sequence[RigidBodyParameters]) -> float:
     """Largest step [s] of these bodies, however slow they are."""
-    return LARGEST_DT if any(body.kind == "dynamic" or body.keyframe for body in parameters) else math.inf
+    has_path = (body.kind == "dynamic" or body.keyframe or body.shape.type == "animation" for body in parameters)
+    return LARGEST_DT if any(has_path) else math.inf
 
 
 _STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost", "is_asleep", "rest_s")
