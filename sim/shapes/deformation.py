@@ -219,28 +219,28 @@ class Deformation:
     @cached_property
     def origin(self) -> NDArray[np.float64]:
         """Of the grids [m], (3,)."""
-        return self._sample(self.solid(0)).origin
+        return self.bounds.mean(axis=0) - 0.5 * self.spacing * (np.array(self.shape) - 1)
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
         """Nodes of the grids along x, y and z."""
-        x, y, z = self._sample(self.solid(0)).values.shape
+        x, y, z = self._field(0)[0].shape
         return x, y, z
-
-    def _sample(self, solid: MeshSolid) -> LevelSet:
-        padding = GRID_PADDING * GRID_CELLS * self.spacing
-        return LevelSet.sample(
-            _InBox(solid, self.bounds), self.spacing, padding=padding, exact_within=EXACT_WITHIN * self.spacing
-        )
 
     def _sampled(self, knot: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Distances [m] and velocities [m/s] of the nodes at a knot."""
         vertices, velocities = self.vertices(float(self._knots[knot]))
-        distances = self._sample(MeshSolid(TriangleMesh(vertices, self.faces))).values
+        level_set = LevelSet.sample(
+            _InBox(MeshSolid(TriangleMesh(vertices, self.faces)), self.bounds),
+            self.spacing,
+            padding=GRID_PADDING * GRID_CELLS * self.spacing,
+            exact_within=EXACT_WITHIN * self.spacing,
+        )
+        distances, origin = level_set.values, level_set.origin
         shape = distances.shape
 
         def felt(nodes: NDArray[np.integer]) -> NDArray[np.float64]:
-            faces, weights, _ = _nearest(vertices, self.faces, self.origin + self.spacing * nodes)
+            faces, weights, _ = _nearest(vertices, self.faces, origin + self.spacing * nodes)
             return np.einsum("mc,mcx->mx", weights, velocities[faces])
 
         sparse = [np.arange(0, count + SPARSE - 1, SPARSE) for count in shape]

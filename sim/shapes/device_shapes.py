@@ -164,6 +164,10 @@ def blend(between: Floats, share: ti.f32, span: ti.f32, first: ti.i32, values: F
         values[first + n] = ti.select(n < count // 4, value, span * value)
 
 
+LONGEST_STEP_S = 0.05
+"""Of who asks what is near: a body's surface gets no farther beyond its sphere within it."""
+
+
 class DeformingGrid:
     """A grid of distances among others that is to be where its body's surface is."""
 
@@ -228,7 +232,9 @@ class DeviceShapes:
                     self._deforming.append(DeformingGrid(deformation, place))
                     values.append(np.zeros(3 * level_set.values.size, np.float32))
             first[number], level_set = sampled[id(geometry)]
-            size[number] = float(geometry.deformation is not None)
+            if geometry.deformation is not None:
+                size[number] = 1.0
+                radius[number] += LONGEST_STEP_S * geometry.deformation.largest_speed
             kind[number], shape[number], origin[number] = GRID, level_set.values.shape, level_set.origin
             spacing[number], step[number] = level_set.spacing, 0.5 * level_set.spacing
         self.centre_of_mass, self.radius, self.step = on_device(centre), on_device(radius), on_device(step)
