@@ -19,7 +19,8 @@ class ContactList:
     """Contacts in no particular order, which no result depends on: all sums over them are sums of integers.
 
     The points of a contact are weighted means of vertices, and so is the relative displacement
-    w = sum_k weights[k] u[vertices[k]], minus that of the body, as it moves and deforms. It has to satisfy n . w >= floor.
+    w = sum_k weights[k] u[vertices[k]], minus that of the body, as it moves and deforms. It has to satisfy
+    n . w >= floor.
 
     Attributes:
         capacity: there is room for so many.

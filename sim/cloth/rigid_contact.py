@@ -394,8 +394,9 @@ def touch_body(
                 friction = ti.sqrt(own_friction * bodies.friction[b])
                 slot = append_contact(contacts, corners, weight, n, least, b, r, friction)
                 if ti.static(contacts.drifts):
+                    place = contacts.capacity + slot
                     if slot < contacts.capacity:
-                        contacts.arm[contacts.capacity + slot] = drift
+                        contacts.arm[place] = drift
 
 
 @func

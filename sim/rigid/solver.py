@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +100,7 @@ class RigidSolver:
         self.deforming = {
             number: solid.deformation for number, solid in enumerate(self.solids) if solid.deformation is not None
         }
+        self._animated = {n for n, body in enumerate(parameters) if body.shape.type == "animation"}
         self._place_kinematic_bodies(0.0)
 
         fixed = _geometries_of(obstacles)
@@ -416,20 +417,39 @@ class RigidSolver:
             self.bodies.angular_velocity[lost] = 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
-        """The pose of each body's own mesh at rest, and the velocity of the mesh's origin."""
+        """The pose of each body's own mesh at rest, and the velocity of the mesh's origin; of one that a file animates
+        the mesh as it is, too.
+        """
         bodies = self.bodies
         turned = bodies.rotation()
         snapshots = {}
         for number, name in enumerate(bodies.names):
             arm = -turned[number] @ self._centres[number]
-            arrays = {
+            arrays: dict[str, NDArray[np.generic]] = {
                 "position": bodies.position[number] + arm,
                 "orientation": bodies.orientation[number].copy(),
                 "velocity": bodies.velocity[number] + rotation.cross(bodies.angular_velocity[number], arm),
                 "angular_velocity": bodies.angular_velocity[number].copy(),
             }
+            if number in self._animated:
+                arrays |= self._mesh_of(number, arrays)
             snapshots[name] = Snapshot("rigid", arrays, {}, self._groups[number])
         return snapshots
+
+    def _mesh_of(self, number: int, pose: Mapping[str, Array]) -> dict[str, NDArray[np.generic]]:
+        """Vertices [m], (n, 3), how they move [m/s], and triangles, (m, 3), of a body with a pose."""
+        mesh = self.solids[number].solid.rest_mesh()
+        vertices, own_velocity = mesh.vertices, np.zeros_like(mesh.vertices)
+        if number in self.deforming:
+            vertices, own_velocity = self.deforming[number].vertices(self.time_s)
+        arms = rotation.rotated(pose["orientation"], vertices)
+        velocity = pose["velocity"] + rotation.cross(pose["angular_velocity"], arms)
+        velocity += rotation.rotated(pose["orientation"], own_velocity)
+        return {
+            "vertices": (pose["position"] + arms).astype(np.float32),
+            "vertex_velocities": velocity.astype(np.float32),
+            "triangles": mesh.faces.astype(np.int32),
+        }
 
     def view(self, body: str) -> dict[str, NDArray[np.generic]]:
         """Pose and velocities of a body, as in its snapshot: copies, of 13 numbers."""

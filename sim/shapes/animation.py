@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,8 @@ RIGID_WITHIN = 2.0e-5
 """A mesh whose points move against each other by less, in its diagonals, is rigid: files have numbers of 24 bits."""
 FLAT = 1.0e-9
 """Least volume of a mesh, in cubes of its diagonal."""
+MOST_BOXES = 16
+"""Around samples, of one animation."""
 TOGETHER = 1.0e-6
 """Points that are never farther apart, in diagonals of the mesh, are one: seams of textures double them."""
 
@@ -53,10 +54,15 @@ class AnimatedSolid(MeshSolid):
         """Where its origin is in the first sample [m], (3,)."""
         return self.positions[0]
 
-    @cached_property
-    def duration(self) -> float:
+    @property
+    def duration_s(self) -> float:
         """From the first sample to the last [s]."""
         return float(self.times[-1])
+
+    def points(self, number: int) -> Points:
+        """The points of a sample, where the file has them [m], (n, 3)."""
+        own = self.mesh.vertices if self.deformed is None else self.deformed[number]
+        return self.positions[number] + rotation.rotated(self.orientations[number], own.astype(np.float64))
 
 
 def path_of_animation(placement: Placement, shape: AnimationShape) -> KeyframePath:
@@ -67,6 +73,20 @@ def path_of_animation(placement: Placement, shape: AnimationShape) -> KeyframePa
     orientations = rotation.product(turned, solid.orientations)
     times = (shape.start_s + solid.times).tolist()
     return KeyframePath(times, positions, orientations, linear=shape.interpolation == "linear")
+
+
+def boxes_of_animation(placement: Placement, shape: AnimationShape) -> list[NDArray[np.float64]]:
+    """Boxes around the first and the last sample of an animated body, and some in between, (2, 3) each [m].
+
+    Raises as `load_animation`.
+    """
+    solid = load_animation(shape)
+    turned = rotation.matrices(rotation.from_degrees(placement.rotation_deg))
+    boxes = []
+    for number in np.unique(np.linspace(0, len(solid.times) - 1, MOST_BOXES).astype(np.int64)):
+        points = solid.points(int(number)) @ turned.T * placement.scale + np.asarray(placement.position)
+        boxes.append(np.stack([points.min(axis=0), points.max(axis=0)]))
+    return boxes
 
 
 def load_animation(shape: AnimationShape) -> AnimatedSolid:
@@ -140,7 +160,7 @@ def _read_into(kept: Path, path: Path, name: str, rate: float) -> None:
                 f'shape.file: "{path}" could not be read by Blender, which ended with {child.returncode}: {last}; '
                 "the package bpy must be installed: pip install bpy"
             )
-        os.replace(out, kept)
+        out.replace(kept)
 
 
 def animated_solid(
@@ -185,9 +205,7 @@ def animated_solid(
     )
 
 
-def _joined(
-    points: NDArray[np.float32], triangles: NDArray[np.int32]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _joined(points: NDArray[np.float32], triangles: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Points that are in one place in every sample joined, and those that no face uses left out."""
     used, numbers = np.unique(triangles, return_inverse=True)
     points, triangles = points[:, used], numbers.reshape(triangles.shape).astype(np.int32)

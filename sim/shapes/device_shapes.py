@@ -133,8 +133,8 @@ def surface_motion(y: Vector3, b: ti.i32, shapes: Shapes) -> Vector3:
     """How the surface near a point in the frame of body b moves there as it deforms; see `DeviceShapes.deform`."""
     motion = Vector3(0.0)
     if ti.static(shapes.deforms):
+        shape = shapes.grid_shape[b]
         if shapes.kind[b] == GRID and shapes.size[b][0] > 0.0:
-            shape = shapes.grid_shape[b]
             place = (y - shapes.grid_origin[b]) / shapes.grid_spacing[b]
             nearest = ti.math.clamp(place, 0.0, ti.cast(shape - 1, ti.f32))
             cell = ti.min(ti.cast(nearest, ti.i32), shape - 2)
