@@ -42,6 +42,7 @@ ANIMATED_BYTES, ANIMATED_S = 1.0e6, 0.1
 
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
+    from pipeline.kinds.checks.animated_bodies import check_animated_bodies
     from pipeline.kinds.checks.joints import check_anchors
     from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
 
@@ -49,6 +50,7 @@ def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) 
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
     check_anchors(job, solids, findings)
+    check_animated_bodies(job, solids, findings)
     return 0
 
 

@@ -9,6 +9,7 @@ import tempfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,7 @@ class AnimatedSolid(MeshSolid):
     times: NDArray[np.float64]  # of the samples, from the first on [s], (k,)
     positions: Points  # of its origin [m], (k, 3)
     orientations: NDArray[np.float64]  # unit quaternions, (k, 4)
+    volumes: NDArray[np.float64]  # of the samples [m³], (k,)
     deformed: NDArray[np.float32] | None  # points about its own origin, (k, n, 3) [m]; None if it is rigid
 
     @property
@@ -140,7 +142,7 @@ def _kept_arrays(
     try:
         with np.load(kept) as arrays:
             return arrays["times"], arrays["points"], arrays["triangles"]
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
 
 
@@ -201,6 +203,7 @@ def animated_solid(
         times=times,
         positions=positions,
         orientations=orientations,
+        volumes=volumes,
         deformed=deformed.astype(np.float32) if largest > RIGID_WITHIN * diagonal else None,
     )
 
