@@ -212,7 +212,9 @@ def joint_problems(
         names.setdefault(joint.name, number)
         if unknown := [name for name in joint.between if name not in kinds]:
             if unknown[0] in cloths:
-                sentence = f'names the cloth "{unknown[0]}", and joints hold rigid bodies alone; let the cloth lie on one'
+                sentence = (
+                    f'names the cloth "{unknown[0]}", and joints hold rigid bodies alone; let the cloth lie on one'
+                )
                 yield JointProblem(number, "between", sentence)
                 continue
             known = f"rigid bodies are {', '.join(kinds)}" if kinds else "add [[rigid]]"
