@@ -107,7 +107,7 @@ def test_a_rigid_animation_moves_water_as_keyframes_do(tmp_path):
     assert ends[0][1][0] > 0.005  # it was pushed
     # Samples differ by rounding, which a splash makes larger.
     np.testing.assert_allclose(ends[1][0], ends[0][0], atol=1e-3 * SPACING)
-    np.testing.assert_allclose(ends[1][1], ends[0][1], atol=1e-4)
+    np.testing.assert_allclose(ends[1][1], ends[0][1], atol=1e-3)
 
 
 def test_a_ball_that_is_touched_takes_the_speed_of_the_surface(files):
