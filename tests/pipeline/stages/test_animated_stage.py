@@ -120,7 +120,7 @@ def test_check_tells_of_growth_in_a_closed_box_of_smoke(tmp_path):
 
 def test_a_camera_frames_where_it_goes(tmp_path):
     corners = box((0.1, 0.1, 0.1))
-    points = np.stack([[*corners, x, 0.0, 0.2] for x in np.linspace(0.0, 0.9, 10)])
+    points = np.stack([corners + np.array([x, 0.0, 0.2]) for x in np.linspace(0.0, 0.9, 10)])
     job = job_of(write_usd(tmp_path / "box.usdc", points, BOX_FACES))
     assert scene_boxes(job)[1:, 1, 0].max() == pytest.approx(0.95, abs=1e-5)
 
