@@ -9,7 +9,10 @@ from sim.shapes.animation import AnimatedSolid
 from sim.shapes.deformation import GRID_CELLS
 from sim.shapes.distance_grids import CELLS_PER_WALL, THIN_SHARE, wall_thickness
 from sim.shapes.parameters import AnimationShape
+from sim.shapes.solid import TriangleMesh
 
+# Times its usual distance that samples of a fluid's boundary may be apart; and part of a surface that may be worse.
+STRETCHED, WORTH_A_WARNING = 1.5, 0.02
 # Share of a frame by which samples may end before the film: times of files are rounded.
 ROUND_OFF = 1.0e-3
 
@@ -41,6 +44,31 @@ def check_animated_bodies(job: Job, solids: Solids, findings: Findings) -> None:
             findings.warn(path, f"is held still {' and '.join(still)}, where its file has no samples")
         if shape.deformed is not None:
             _check_walls(job, index, shape, solid.scale, findings)
+            if job.fluid:
+                _check_stretch(index, shape, findings)
+
+
+def _check_stretch(index: int, shape: AnimatedSolid, findings: Findings) -> None:
+    """Note a surface that is stretched elsewhere than where it is largest: samples spread there are too far apart."""
+    assert shape.deformed is not None, "only meshes that deform are stretched"
+    areas = np.stack(
+        [
+            np.linalg.norm(TriangleMesh(points.astype(np.float64), shape.mesh.faces).area_vectors, axis=1)
+            for points in shape.deformed
+        ]
+    )
+    widest = areas[np.argmax(areas.sum(axis=1))]
+    largest, number = areas.max(axis=0), areas.argmax(axis=0)
+    is_stretched = largest > STRETCHED**2 * widest
+    share = float(largest[is_stretched].sum() / largest.sum())
+    if share > WORTH_A_WARNING:
+        worst = int(np.argmax(np.where(is_stretched, largest - widest, 0.0)))
+        findings.warn(
+            ("rigid", index, "shape"),
+            f"stretches {share:.0%} of its surface to more than {STRETCHED:g} times its width in the sample where it "
+            f"is largest, most at {shape.times[number[worst]]:.4g} s after its first: fluid may leak in there; stretch "
+            "it less, or animate its parts as bodies of their own (shape.object)",
+        )
 
 
 def _check_walls(job: Job, index: int, shape: AnimatedSolid, scale: float, findings: Findings) -> None:

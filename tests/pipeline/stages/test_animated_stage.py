@@ -118,6 +118,20 @@ def test_check_tells_of_growth_in_a_closed_box_of_smoke(tmp_path):
     assert not [line for line in checked(JOB_FILE + opened, tmp_path / "job.toml").warnings if "takes about" in line]
 
 
+def test_check_tells_of_a_surface_that_is_stretched_for_a_fluid(tmp_path):
+    water = '[[fluid]]\nname = "water"\n[[fluid.block]]\nshape = { type = "box", size = [0.3, 0.3, 0.2] }\n'
+    water += "position = [0.3, 0.0, 0.1]\n"
+    with_lung(tmp_path)  # it grows as a whole, and is sampled where it is largest
+    text = JOB_FILE + water
+    assert not [line for line in checked(text, tmp_path / "job.toml").warnings if "stretches" in line]
+    vertices, faces = ball(0.1, 2)
+    # One side, then the other, is drawn out.
+    pulled = np.stack([vertices * (1.0 + 3.0 * (sign * vertices[:, :1] > 0.0) * [1, 0, 0]) for sign in (1, -1, 1)])
+    write_usd(tmp_path / "lung.usdc", pulled, faces)
+    (line,) = [line for line in checked(text, tmp_path / "job.toml").warnings if "stretches" in line]
+    assert "most at 0.04167 s after its first: fluid may leak in there" in line
+
+
 def test_a_camera_frames_where_it_goes(tmp_path):
     corners = box((0.1, 0.1, 0.1))
     points = np.stack([corners + np.array([x, 0.0, 0.2]) for x in np.linspace(0.0, 0.9, 10)])
