@@ -119,7 +119,7 @@ class CollisionDetector:
             fill(getattr(self._kept, name), np.array(arrays[f"contact_{name}"]))
         fill(self._near.before, np.arange(len(pairs), dtype=np.int32))
 
-    def find(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_], time_s: float) -> None:
+    def find(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_], time_s: float = 0.0) -> None:
         """Find the contacts of all active bodies in poses, and in the shapes that they have at a time [s].
 
         The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the step
