@@ -116,7 +116,7 @@ class Scene:
         - fluid: `position` [m], `velocity` [m/s], (n, 3); `particle_id` (n,); in the solver's order, which changes
         - cloth: `position` [m], `velocity` [m/s], (n, 3), in the order of the snapshot
         - rigid: `position`, `orientation`, `velocity`, `angular_velocity`, as in the snapshot; of a group, by its name,
-          those of all its bodies, (n, 3) and (n, 4)
+          those of all its bodies, (n, 3) and (n, 4); of one that a file animates its mesh, too
         - smoke: `density` [-], `excess_temperature` [K], (nx, ny, nz)
 
         Raises:

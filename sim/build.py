@@ -175,7 +175,8 @@ def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: f
 def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
     """The solver of the bodies that move, if there are any."""
     problems = [
-        f'joint "{scene.joint[each.number].name}": {each.text}' for each in joint_problems(scene.joint, scene.rigid)
+        f'joint "{scene.joint[each.number].name}": {each.text}'
+        for each in joint_problems(scene.joint, scene.rigid, [cloth.name for cloth in scene.cloth])
     ]
     if problems:
         raise ValueError("; ".join(problems))

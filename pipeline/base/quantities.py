@@ -41,6 +41,9 @@ def quantity(name: str, *, of_kind: str | None = None) -> Quantity:
     found = _KNOWN.get(name)
     if found is None and name.startswith(COUNT_OF_FLUID):
         return Quantity(name, f"particles of {name.removeprefix(COUNT_OF_FLUID)}", "", _COUNT, counted=True)
+    if found is None and name.startswith(APART_OF_JOINT):
+        joint = name.removeprefix(APART_OF_JOINT)
+        return Quantity(name, f'steps with "{joint}" apart', "", "Joints apart", counted=True)
     if found is None:
         label = name.replace("_", " ")
         return Quantity(name, label, "", label.capitalize())
@@ -136,6 +139,10 @@ def with_energy(numbers: Mapping[str, float]) -> dict[str, float]:
     return {**numbers, MECHANICAL_ENERGY: sum(numbers.get(part, 0.0) for part in PARTS_OF_ENERGY)}
 
 
+APART_OF_JOINT = "joints_apart_"
+"""Begins the name of the number of steps in which one joint was apart; its name follows."""
+
+
 @dataclass(frozen=True, slots=True)
 class CountedEvent:
     """A number of the diagnostics that counts what should not happen."""
@@ -149,6 +156,7 @@ class CountedEvent:
     means: Mapping[str, str] = field(default_factory=dict, hash=False)
     # the number that tells how bad it was, by kind of body: {worst} in what it means
     measured_by: Mapping[str, str] = field(default_factory=dict, hash=False)
+    named_by: str = ""  # begins the names of numbers that are not 0 for whom it happened to; their names follow
 
     def text(self, count: int) -> str:
         """Count in words: `3 solves hit their iteration limit`."""
@@ -195,6 +203,7 @@ WARNINGS = (
             "rigid": "joints ask for what no motion gives, by the largest gap that is told: bodies shake there; remove "
             "a joint of the loop, let a hinge be a ball, or move limits and motors so that they agree",
         },
+        named_by=APART_OF_JOINT,
     ),
     CountedEvent("crossings_left", "crossing", "crossings", " of cloth could not be prevented"),
     CountedEvent(

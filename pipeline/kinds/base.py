@@ -76,6 +76,7 @@ class Product:
 
     stage: str  # name of the stage, and the first part of its tasks' names
     version: int  # raised when the same cache gives another file
+    of: Callable[[Any], bool] = lambda _body: True  # whether it is made of a body
     folder: str  # of the files in the job's folder
     suffix: str  # of the files
     tools: Callable[[Job], Mapping[str, str]]  # version of each package that does the work

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
-from pipeline.kinds.base import Display, Kind, Materials, Solids
+from pipeline.kinds.base import Display, Kind, Materials, Product, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import RIGID_LIVE
 from pipeline.kinds.sizes import boxes_of_body, size_of_solid
@@ -22,16 +23,26 @@ from pipeline.model.job import Job
 from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_points
-from render.meshes import read_ply
-from render.spec import MeshObject, MovingMeshObject, SceneObject
+from render.meshes import read_ply, validate_ply, with_sharp_edges, write_ply
+from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, SceneObject
 from sim.core.motion.rotation import rotated
+from sim.core.snapshots import Snapshot
 from sim.rigid.parameters import RigidBodyParameters
+from sim.shapes.parameters import AnimationShape
 
 if TYPE_CHECKING:
     import h5py
 
+SHARP_DEG = 40.0
+"""Edges of animated meshes that are sharper stay sharp, as those of meshes at rest do."""
+BASE_BYTES = 400_000_000
+"""Interpreter, numpy, h5py and a mesh of half a million triangles."""
+ANIMATED_BYTES, ANIMATED_S = 1.0e6, 0.1
+"""About what a mesh of ten thousand triangles takes."""
+
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
+    from pipeline.kinds.checks.animated_bodies import check_animated_bodies
     from pipeline.kinds.checks.joints import check_anchors
     from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
 
@@ -39,11 +50,15 @@ def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) 
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
     check_anchors(job, solids, findings)
+    check_animated_bodies(job, solids, findings)
     return 0
 
 
 def _objects(_job: Job, layout: JobLayout, body: RigidBodyParameters, material_of: Materials) -> Iterator[SceneObject]:
-    """A static body stands where the job puts it; the others are where the poses of the frame say."""
+    """A static body stands where the job puts it; the others are where the poses of the frame say, or their meshes."""
+    if is_animated(body):
+        yield MeshSequenceObject(name=body.name, file=ANIMATED.file_of(body.name), material=material_of(BODY))
+        return
     for part in parts_of(body.shape.type):
         name = body.name if part == BODY else f"{body.name}.{part}"
         file, material = layout.body_mesh(body.model, part), material_of(part)
@@ -69,13 +84,16 @@ def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.
     """How far a body that moves reaches; one that stands still is of the film, not of a frame."""
     if body.kind == "static":
         return None
+    if is_animated(body):
+        return reach_of_points(group["vertices"][()])
     position, orientation = (np.asarray(group[key][()], np.float64) for key in ("position", "orientation"))
     return reach_of_points(position + rotated(orientation, rest_vertices(layout, body)))
 
 
 def meshes_at_rest(bodies: Iterable[RigidBodyParameters]) -> tuple[ArtifactPath, ...]:
-    """Files of the meshes of bodies at rest, each once."""
-    files = (JobLayout.body_mesh(body.model, part) for body in bodies for part in parts_of(body.shape.type))
+    """Files of the meshes of bodies at rest, each once; what a file animates has none."""
+    still = (body for body in bodies if not is_animated(body))
+    files = (JobLayout.body_mesh(body.model, part) for body in still for part in parts_of(body.shape.type))
     return tuple(dict.fromkeys(files))
 
 
@@ -90,6 +108,35 @@ def _vertices(path: Path, _mtime_ns: int) -> NDArray[np.float32]:
     return read_ply(path).vertices
 
 
+def is_animated(body: RigidBodyParameters) -> bool:
+    """Whether a file moves and deforms the mesh of a body."""
+    return isinstance(body.shape, AnimationShape)
+
+
+def _write_animated(path: Path, body: Snapshot, _job: Job, _threads: int) -> None:
+    arrays = body.arrays
+    vertices, velocities, faces, normals = with_sharp_edges(
+        arrays["vertices"], arrays["vertex_velocities"], arrays["triangles"], angle_deg=SHARP_DEG
+    )
+    write_ply(path, vertices, faces, normals=normals, velocities=velocities)
+
+
+ANIMATED = Product(
+    stage="animated",
+    about="meshes of animated bodies",
+    version=1,
+    of=is_animated,
+    folder="animated",
+    suffix=".ply",
+    tools=lambda _job: {"numpy": tool_version("numpy")},
+    parameters=lambda _job: {},
+    memory_bytes=lambda _job, _body: BASE_BYTES,
+    write=_write_animated,
+    validate=validate_ply,
+    file_bytes=lambda _elements: ANIMATED_BYTES,
+    work=lambda _job, _elements: Work(0.0, ANIMATED_S),
+)
+
 RIGID = Kind(
     name="rigid",
     parameters=RigidBodyParameters,
@@ -101,6 +148,7 @@ RIGID = Kind(
     placements=lambda job, index: iter([((), job.rigid[index])]),
     check=_check,
     shares_solver=lambda body: body.kind != "static",
+    product=ANIMATED,
     objects=_objects,
     reach=_reach,
     display=Display("Rigid bodies", "parts"),

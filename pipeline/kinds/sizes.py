@@ -7,6 +7,8 @@ from functools import cache
 from math import hypot, pi, prod
 from typing import NamedTuple
 
+import numpy as np
+
 from pipeline.base.content import status_of
 from pipeline.base.errors import MissingInputError
 from pipeline.kinds.elements import sheet_of
@@ -16,7 +18,7 @@ from sim.cloth.parameters import ClothParameters
 from sim.core.parameters import Vector3
 from sim.fluid.parameters import FluidParameters
 from sim.rigid.parameters import RigidBodyParameters
-from sim.shapes.parameters import BoxShape, MeshShape, Placement
+from sim.shapes.parameters import AnimationShape, BoxShape, FileShape, Placement, Shape
 from sim.smoke.parameters import SmokeParameters
 
 
@@ -42,10 +44,10 @@ def measures_of(placement: Placement) -> Measures:
         return _scaled(DUCK, shape.length * placement.scale)
     if shape.type == "bunny":
         return _scaled(BUNNY, shape.height * placement.scale)
-    if shape.type == "mesh":
+    if isinstance(shape, FileShape):
         status = status_of(shape.file, "mesh")
-        return _scaled(_of_mesh(shape, status.st_size, status.st_mtime_ns), placement.scale)
-    return _scaled(_built(Placement(shape=shape)), placement.scale)
+        return _scaled(_of_file(shape, status.st_size, status.st_mtime_ns), placement.scale)
+    return _scaled(_built(shape), placement.scale)
 
 
 def _scaled(measures: Measures, factor: float) -> Measures:
@@ -54,21 +56,21 @@ def _scaled(measures: Measures, factor: float) -> Measures:
 
 
 @cache
-def _of_mesh(shape: MeshShape, _size: int, _mtime_ns: int) -> Measures:
-    return _built(Placement(shape=shape))
+def _of_file(shape: Shape, _size: int, _mtime_ns: int) -> Measures:
+    return _built(shape)
 
 
 @cache
-def _built(placement: Placement) -> Measures:
-    from sim.shapes.placement import build_solid
+def _built(shape: Shape) -> Measures:
+    from sim.shapes.placement import build_rest_shape
     from sim.shapes.solid import ShapeError
 
     try:
-        solid = build_solid(placement)
+        rest = build_rest_shape(shape)
     except ShapeError as error:
         raise MissingInputError(f"{error}; the job needs it") from error
-    x, y, z = (solid.bounds[1] - solid.bounds[0]).tolist()
-    return Measures(solid.volume, (x, y, z))
+    x, y, z = (float(rest.support(axis).item() + rest.support(-axis).item()) for axis in np.eye(3)[:, None])
+    return Measures(rest.volume, (x, y, z))
 
 
 def box_of(placement: Placement) -> Box:
@@ -120,7 +122,13 @@ def size_of_sheet(_job: Job, cloth: ClothParameters) -> float:
 
 
 def boxes_of_body(_job: Job, body: RigidBodyParameters) -> Iterator[Box]:
-    """Where a body starts, and where its keyframes lead it. Raises as `measures_of`."""
+    """Where a body starts, and where its keyframes or its file lead it. Raises as `measures_of`."""
+    if isinstance(body.shape, AnimationShape):
+        measures_of(body)
+        from sim.shapes.animation import boxes_of_animation
+
+        yield from boxes_of_animation(body, body.shape)
+        return
     yield box_of(body)
     for key in body.keyframe[1:]:
         yield box_of(body.model_copy(update={"position": key.position, "rotation_deg": key.rotation_deg}))

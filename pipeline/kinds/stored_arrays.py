@@ -19,6 +19,8 @@ MOST_COMPRESSED = 1100
 _UNITS = {
     "position": "m",
     "velocity": "m/s",
+    "vertices": "m",
+    "vertex_velocities": "m/s",
     "angular_velocity": "rad/s",
     "pressure": "Pa",
     "temperature": "K",

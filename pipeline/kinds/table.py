@@ -124,7 +124,7 @@ def products_of(job: Job, layout: JobLayout, frame: int) -> list[tuple[Kind, Any
     return [
         (kind, body, layout.product(kind.product.folder, body.name, frame, kind.product.suffix))
         for _, kind, body in bodies(job)
-        if kind.product is not None
+        if kind.product is not None and kind.product.of(body)
     ]
 
 

@@ -7,12 +7,12 @@ from pydantic import BaseModel
 
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from sim.shapes.parameters import MeshShape
+from sim.shapes.parameters import FileShape
 
 
-def mesh_shapes(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, MeshShape]]:
-    """Every mesh below a table of the job, with the path of its shape, in the order of the keys."""
-    if isinstance(value, MeshShape):
+def mesh_shapes(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, FileShape]]:
+    """Every mesh, still or animated, below a table of the job, with the path of its shape, in the order of the keys."""
+    if isinstance(value, FileShape):
         yield path, value
     elif isinstance(value, BaseModel):
         for key in type(value).model_fields:

@@ -26,6 +26,7 @@ LINE_WIDTH = 100
 NUMBERS_OF_WARNINGS = [event.name for event in WARNINGS] + [
     measure for event in WARNINGS for measure in event.measured_by.values()
 ]
+NUMBERS_OF_WARNINGS += [f"{event.named_by}*" for event in WARNINGS if event.named_by]
 """What `count_warnings` needs of a frame."""
 _TIED = "\N{NO-BREAK SPACE}"
 
@@ -75,11 +76,13 @@ class CountedWarning:
     count: int
     frames: tuple[int, ...]
     worst: float | None = None  # the largest number in these frames of what the event is measured by
+    names: tuple[str, ...] = ()  # to whom it happened, if that is told
 
     def __str__(self) -> str:
         """`water: 3 solves hit their iteration limit, frames 12, 15-16`, and what that means."""
         plural = "s" if len(self.frames) > 1 else ""
-        told = f"{self.solver}: {self.event.text(self.count)}, frame{plural} {_ranges(self.frames)}"
+        who = f" ({', '.join(self.names)})" if self.names else ""
+        told = f"{self.solver}: {self.event.text(self.count)}{who}, frame{plural} {_ranges(self.frames)}"
         meaning = self.event.means.get(self.kind)
         if meaning is None:
             return told
@@ -146,6 +149,7 @@ def count_warnings(frames: Iterable[FrameNumbers]) -> list[CountedWarning]:
     """What happened in these frames that should not, by solver."""
     counts: dict[tuple[str, str, CountedEvent], dict[int, int]] = {}
     measured: dict[tuple[str, str, CountedEvent], float] = {}
+    names: dict[tuple[str, str, CountedEvent], dict[str, None]] = {}
     totals: dict[tuple[str, CountedEvent], int] = {}
     for each in frames:
         for solver, event, count in _events_of(each.solvers):
@@ -156,7 +160,19 @@ def count_warnings(frames: Iterable[FrameNumbers]) -> list[CountedWarning]:
                 counts.setdefault((solver, kind, event), {})[each.frame] = news
                 if (worst := _measured(event, kind, each.solvers[solver])) is not None:
                     measured[solver, kind, event] = max(worst, measured.get((solver, kind, event), 0.0))
-    return [CountedWarning(*of, sum(news.values()), tuple(news), measured.get(of)) for of, news in counts.items()]
+                names.setdefault((solver, kind, event), {}).update(dict.fromkeys(_names(event, each.solvers[solver])))
+    return [
+        CountedWarning(*of, sum(news.values()), tuple(news), measured.get(of), tuple(names.get(of, ())))
+        for of, news in counts.items()
+    ]
+
+
+def _names(event: CountedEvent, of: Diagnostics) -> list[str]:
+    """To whom an event happened by a solver's numbers, most often first, if that is told."""
+    if not event.named_by:
+        return []
+    found = [name for name in of if name.startswith(event.named_by)]
+    return [name.removeprefix(event.named_by) for name in sorted(found, key=lambda name: -of[name])]
 
 
 def _measured(event: CountedEvent, kind: str, of: Diagnostics) -> float | None:
@@ -203,7 +219,8 @@ class SolverWatch:
                 self._told.add((solver, happened.name))
                 kind, frame = kinds.get(solver, solver), _frame_of(artifact)
                 worst = _measured(happened, kind, solvers[solver])
-                warning = CountedWarning(solver, kind, happened, count, (frame,), worst)
+                names = tuple(_names(happened, solvers[solver]))
+                warning = CountedWarning(solver, kind, happened, count, (frame,), worst, names)
                 self._say(f"{warning}; later ones are counted: pipeline status")
 
 

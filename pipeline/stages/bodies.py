@@ -11,6 +11,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Task, TaskId
 from pipeline.kinds.base import Work
+from pipeline.kinds.rigid import is_animated
 from pipeline.kinds.table import material_of
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
@@ -63,7 +64,7 @@ class BodiesStage(Stage):
                 subject=body.name,
             )
             for body in job.rigid
-            if body.is_own_model
+            if body.is_own_model and not is_animated(body)
         ]
 
     def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002

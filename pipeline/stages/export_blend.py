@@ -82,7 +82,7 @@ class BlendExport(_SceneExport):
     version = 2
     about = "the scene for Blender"
     opened_by = "open {file} in Blender 4.5 LTS or later; it plays the files beside it"
-    refers_to = ("surfaces", "cloths", "drops", "whitewater", "volumes")
+    refers_to = ("surfaces", "cloths", "animated", "drops", "whitewater", "volumes")
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame with fluids that touch something, and one for the scene."""

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
-from pipeline.kinds.rigid import meshes_at_rest
+from pipeline.kinds.rigid import is_animated, meshes_at_rest
 from pipeline.kinds.stored_arrays import unit_of
 from pipeline.kinds.table import bodies, points_of
 from pipeline.model.job import Job
@@ -144,6 +144,13 @@ class _Frame:
         write_polydata(path, position, triangles=triangles, point_values=values, time_s=self._time_s)
 
     def _parts(self, path: Path, *, body: Any) -> None:
+        if is_animated(body):
+            arrays = read_compact(self._cache, body.name).arrays
+            led = {"velocity": Values(arrays["vertex_velocities"], "m/s")}
+            write_polydata(
+                path, arrays["vertices"], triangles=arrays["triangles"], point_values=led, time_s=self._time_s
+            )
+            return
         meshes = [read_ply(self._layout.path(mesh)) for mesh in meshes_at_rest([body])]
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         rest = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float64)

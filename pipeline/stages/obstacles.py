@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.kinds.rigid import is_animated
 from pipeline.model.job import Job
 from pipeline.store.cache import read_frame
 from sim.core.snapshots import Snapshot
@@ -26,10 +27,12 @@ def moving_obstacles(
     job: Job, before: Mapping[str, Snapshot], now: Mapping[str, Snapshot], particle_radius: float
 ) -> list[MovingObstacle]:
     """The rigid bodies between two frames, for a fluid of this particle radius [m]."""
-    from sim.whitewater.obstacles import MovingObstacle, Pose
+    from sim.whitewater.obstacles import MovingObstacle, Pose, deformed
 
     return [
-        MovingObstacle(
+        deformed(before[body.name], now[body.name], particle_radius)
+        if is_animated(body)
+        else MovingObstacle(
             _level_set(Placement(shape=body.shape, scale=body.scale).model_dump_json(), particle_radius),
             Pose.of_snapshot(before[body.name]),
             Pose.of_snapshot(now[body.name]),

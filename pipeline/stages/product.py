@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
@@ -23,7 +24,7 @@ class ProductStage(Stage):
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a body and frame."""
         product = self._product
-        bodies = self._kind.bodies(job)
+        bodies = self._bodies(job)
         if not bodies:
             return []
         parameters = ParameterSet.of(
@@ -45,9 +46,12 @@ class ProductStage(Stage):
             for frame in range(job.frame_count)
         ]
 
+    def _bodies(self, job: Job) -> list[Any]:
+        return [body for body in self._kind.bodies(job) if self._product.of(body)]
+
     def preflight(self, job: Job) -> list[str]:
         """What this machine lacks to make the files, if there are any to make."""
-        return self._product.preflight() if self._kind.bodies(job) else []
+        return self._product.preflight() if self._bodies(job) else []
 
     def lighter(self, job: Job) -> str:  # noqa: ARG002
         """What the kind says."""
@@ -55,7 +59,7 @@ class ProductStage(Stage):
 
     def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
         """What the kind says of a body with the mean number of elements."""
-        count = elements.get(self._kind.name, 0.0) / max(1, len(self._kind.bodies(job)))
+        count = elements.get(self._kind.name, 0.0) / max(1, len(self._bodies(job)))
         return FileWork(self._kind.name, self._product.work(job, count).plus(Work(0.0, FILE_S)))
 
     def run(self, context: TaskContext) -> None:

@@ -13,7 +13,7 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.job.input_files import split_blend
 from pipeline.kinds.base import Work
-from pipeline.kinds.rigid import meshes_at_rest
+from pipeline.kinds.rigid import is_animated, meshes_at_rest
 from pipeline.kinds.table import KINDS, material_of, points_of, products_of
 from pipeline.model.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.model.job import Job
@@ -272,8 +272,9 @@ def _without_coordinates(job: Job, layout: JobLayout) -> Iterator[tuple[str, str
     for body in job.rigid:
         for part in parts_of(body.shape.type):
             material = material_of(job, body.name, part)
-            mesh = layout.path(layout.body_mesh(body.model, part))
-            if material.blend is not None and read_ply(mesh).corner_uv is None:
+            if material.blend is None:
+                continue
+            if is_animated(body) or read_ply(layout.path(layout.body_mesh(body.model, part))).corner_uv is None:
                 yield body.name if part == BODY else f"{body.name}.{part}", material.blend
     for fluid in job.fluid:
         if (blend := material_of(job, fluid.name).blend) is not None:

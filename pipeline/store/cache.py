@@ -293,9 +293,18 @@ def _kind_of(group: BodyGroup) -> str:
 
 def _read_diagnostics(file: h5py.File, only: Collection[str] | None = None) -> dict[str, Diagnostics]:
     return {
-        name: {key: float(group.attrs[key]) for key in (group.attrs if only is None else only) if key in group.attrs}
+        name: {key: float(group.attrs[key]) for key in _keys_of(group.attrs, only)}
         for name, group in file.get("diagnostics", {}).items()
     }
+
+
+def _keys_of(attributes: h5py.AttributeManager, only: Collection[str] | None) -> list[str]:
+    """Keys of attributes: all, or those that are named, by the whole name or, with `*`, by its beginning."""
+    if only is None:
+        return list(attributes)
+    found = [key for key in only if key in attributes]
+    beginnings = tuple(key.removesuffix("*") for key in only if key.endswith("*"))
+    return [*found, *(key for key in attributes if key.startswith(beginnings))] if beginnings and found else found
 
 
 def _plain(value: Any) -> Attribute:

@@ -409,7 +409,8 @@ class Contacts(NamedTuple):
     normal: Vectors  # unit vector from the second to the first, or out of the body
     floor: Floats  # least relative displacement along the normal [m], or `INACTIVE`
     kind: Integers  # `VERTEX_TRIANGLE`, `EDGE_EDGE`, `WALL`, or the number of a body
-    arm: Vectors  # from the body's centre of mass to the point [m]
+    arm: Vectors  # from the body's centre of mass to the point [m]; then, if it `drifts`, how the surface does [m]
+    drifts: ti.template()  # whether any body deforms
     friction: Floats  # Coulomb's coefficient [-]
     counter: Integers  # (5,)
     capacity: ti.i32

@@ -49,6 +49,8 @@ def relative_displacement(c: ti.i32, r: Response) -> ti.math.vec3:
     b = contacts.kind[c]
     if b >= 0:
         w -= r.bodies.motion[2 * b] + r.bodies.motion[2 * b + 1].cross(contacts.arm[c])
+        if ti.static(contacts.drifts):
+            w -= contacts.arm[contacts.capacity + c]
     return w
 
 

@@ -71,7 +71,7 @@ class ContinuousContacts:
         self._patches = self._pairs.patches
         self.rigid.set_spacing(self._pairs.coarsest_edge, self._pairs.longest_edge)
         n = state.vertex_count
-        self._contacts = ContactList(4 * n)
+        self._contacts = ContactList(4 * n, drifts=self.rigid.bodies.on_device.deforms)
         self._pushed: PushedNodes = with_room(
             PushedNodes,
             n,

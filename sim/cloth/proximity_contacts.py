@@ -18,7 +18,8 @@ class ContactList:
     """Contacts in no particular order, which no result depends on: all sums over them are sums of integers.
 
     The points of a contact are weighted means of vertices, and so is the relative displacement
-    w = sum_k weights[k] u[vertices[k]], minus that of the body. It has to satisfy n . w >= floor.
+    w = sum_k weights[k] u[vertices[k]], minus that of the body, as it moves and deforms. It has to satisfy
+    n . w >= floor.
 
     Attributes:
         capacity: there is room for so many.
@@ -28,7 +29,9 @@ class ContactList:
         crossing: whether pairs may have crossed, (capacity,).
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, *, drifts: bool = False) -> None:
+        """Room for so many; `drifts` where some are with bodies that deform."""
+        self._drifts = drifts
         self._counter = ti.ndarray(ti.i32, 5)
         self.forget()
         self._allocate(capacity)
@@ -50,7 +53,11 @@ class ContactList:
 
     def _allocate(self, capacity: int) -> None:
         self.capacity = max(capacity, 1)
-        self.found: Contacts = with_room(Contacts, self.capacity, counter=self._counter, capacity=self.capacity)
+        # Kernels bear no further array: drifts follow the arms.
+        arm = ti.Vector.ndarray(3, ti.f32, (2 if self._drifts else 1) * self.capacity)
+        self.found: Contacts = with_room(
+            Contacts, self.capacity, counter=self._counter, capacity=self.capacity, arm=arm, drifts=self._drifts
+        )
         uses = {"used_by": ti.ndarray(ti.i32, 4 * self.capacity), "use_weight": ti.ndarray(ti.f32, 4 * self.capacity)}
         self._impulses: Impulses = with_room(Impulses, self.capacity, unit=1.0, **uses)
         self.crossing = ti.ndarray(ti.i32, self.capacity)
@@ -66,13 +73,14 @@ def append_contact(
     kind: ti.i32,
     arm: ti.math.vec3,
     friction: ti.f32,
-):
-    """Append a contact if there is room; it is counted in any case."""
+) -> ti.i32:
+    """Append a contact if there is room; it is counted in any case. Returns its number."""
     slot = ti.atomic_add(contacts.counter[0], 1)
     if slot < contacts.capacity:
         contacts.vertices[slot], contacts.weights[slot], contacts.normal[slot] = vertices, weights, normal
         contacts.floor[slot], contacts.kind[slot] = floor, kind
         contacts.arm[slot], contacts.friction[slot] = arm, friction
+    return slot
 
 
 @ti.func

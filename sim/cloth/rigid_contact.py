@@ -34,7 +34,7 @@ from sim.core.reductions import LaneReduction, Share, reduced
 from sim.core.scheduling import begin_sharing, next_item, workers_for
 from sim.core.walls import Wall
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.device_shapes import CAPSULE, GRID, SPHERE, TORUS, DeviceShapes, Shapes, distance_to
+from sim.shapes.device_shapes import CAPSULE, GRID, SPHERE, TORUS, DeviceShapes, Shapes, distance_to, surface_motion
 
 Array = NDArray[np.float64]
 
@@ -151,6 +151,7 @@ class RigidContact:
     def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float], walls: Sequence[Wall]) -> None:
         self.bodies = CollisionBodies(geometries, friction)
         self._motion: BodyMotion | None = None
+        self._time_s = 0.0
         self._advance = LARGEST_ADVANCE * 0.5 * np.array([geometry.shortest_edge for geometry in geometries])
         self._advance_on_device = on_device(self._advance)
         self._moving = ti.Vector.ndarray(4, ti.f32, max(len(geometries), 1))
@@ -195,9 +196,10 @@ class RigidContact:
             self._shows = shows
             put(colliding.shows, np.where(kind == SPHERE, 1, 2) * shows)
 
-    def place(self, poses: Poses, motion: BodyMotion | None = None) -> None:
-        """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
-        b = self.bodies.count
+    def place(self, poses: Poses, motion: BodyMotion | None = None, time_s: float = 0.0) -> None:
+        """Say where the bodies are at the start of a substep, at a time [s], and how they move; without motion they
+        stand still."""
+        b, self._time_s = self.bodies.count, time_s
         inverse_mass, inverse_inertia = np.zeros(b), np.zeros((b, 3, 3))
         self._velocity, self._spin_speed = np.zeros((b, 3)), np.zeros(b)
         self._motion = motion
@@ -206,6 +208,9 @@ class RigidContact:
             inverse_mass[:m], inverse_inertia[:m] = motion.inverse_mass, motion.inverse_inertia
             self._velocity[:m] = motion.velocity
             self._spin_speed[:m] = self._radius[:m] * np.linalg.norm(motion.angular_velocity, axis=1)
+            for number, geometry in enumerate(self.bodies.geometries[:m]):
+                if geometry.deformation is not None:
+                    self._spin_speed[number] += geometry.deformation.speed(time_s)
         if b:
             colliding, pushed = self.bodies.colliding, self.bodies.pushed
             put(colliding.position, poses.position[:b])
@@ -228,6 +233,7 @@ class RigidContact:
             turn[:m] = dt * motion.angular_velocity
             if b:
                 put(self.bodies.colliding.motion, np.stack([shift, turn], axis=1).reshape(-1, 3))
+            self.bodies.deform(self._time_s, dt)
 
     def stable_dt(self, state: ClothState, nodes: range, box: Box, *, at_most: float) -> float:
         """Largest step [s] for some nodes, of one cloth or of several.
@@ -413,6 +419,11 @@ def touch_body(
     if r.norm_sqr() < reach * reach:
         turned = bodies.rotation[b]
         y = turned.transpose() @ r + bodies.centre_of_mass[b]
+        drift = ti.math.vec3(0.0)
+        if ti.static(bodies.shapes.deforms):
+            drift = turned @ surface_motion(y, b, bodies.shapes)
+            relative -= drift
+            comes = relative.norm() + allowed
         distance = distance_to(y, b, bodies.shapes)
         if half > 0.0 and -0.5 * distance / half > bodies.depth[b]:
             ti.atomic_max(bodies.depth[b], -0.5 * distance / half)
@@ -427,7 +438,11 @@ def touch_body(
             least = least_displacement(distance, keeps, near.recovery)
             if distance < keeps or n.dot(relative) < least + allowed:
                 friction = ti.sqrt(surface.friction[v[0]] * bodies.friction[b])
-                append_contact(near.contacts, v, weight, n, least, b, r, friction)
+                slot = append_contact(near.contacts, v, weight, n, least, b, r, friction)
+                if ti.static(near.contacts.drifts):
+                    place = near.contacts.capacity + slot
+                    if slot < near.contacts.capacity:
+                        near.contacts.arm[place] = drift
 
 
 @func
@@ -544,6 +559,8 @@ def touch_triangle(b: ti.i32, corners: Three, allowed: ti.f32, near: Touching):
         at = bodies.rotation[b].transpose() @ r + bodies.centre_of_mass[b]
         for axis in ti.static(range(3)):
             x[k, axis], y[k, axis] = surface.position[v[k]][axis], at[axis]
+        if ti.static(bodies.shapes.deforms):
+            comes = ti.max(comes, relative.norm() + allowed + surface_motion(at, b, bodies.shapes).norm())
     size = ti.max((y[1, :] - y[0, :]).norm(), (y[2, :] - y[0, :]).norm())
     if nearest < bodies.radius[b] + half + size + comes:
         in_middle = distance_to(y.transpose() @ ti.math.vec3(third), b, bodies.shapes)

@@ -35,7 +35,8 @@ def expected_body_speed(
     for body, geometry in zip(parameters, geometries, strict=True):
         arm = geometry.centre_of_mass
         if body.kind == "kinematic":
-            speeds.append(path_of(body).largest_speed(float(np.linalg.norm(arm)) + geometry.radius))
+            deforming = 0.0 if geometry.deformation is None else geometry.deformation.largest_speed
+            speeds.append(path_of(body).largest_speed(float(np.linalg.norm(arm)) + geometry.radius) + deforming)
             continue
         centre = np.asarray(body.position) + rotation.rotated(rotation.from_degrees(body.rotation_deg), arm)
         fall = square_of_fall_speed(centre[None], domain, gravity)

@@ -61,7 +61,7 @@ class ClothRigidCoupling(Coupling):
             inverse_mass=bodies.inverse_mass,
             inverse_inertia=bodies.inverse_inertia(),
         )
-        self._contacts.rigid.place(self._rigid.poses(), motion)
+        self._contacts.rigid.place(self._rigid.poses(), motion, self._rigid.time_s)
 
     def resume(self) -> None:
         """Tell the cloth's contacts where the restored bodies are, and how rough they are now."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +13,12 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from sim.core.solver import Coupling
-from sim.fluid.boundary import BodyStates
+from sim.fluid.boundary import BodyStates, Boundary
 from sim.fluid.boundary_akinci2012 import BoundarySamples, sink_samples
-from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, wall_calibration
+from sim.fluid.kernels import SUPPORT_IN_SPACINGS, Discretization, evaluate, wall_calibration
+from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.deformation import Deformation
+from sim.shapes.sampling import sample_surface
 from sim.shapes.solid import SignedDistance, outward_normals
 
 if TYPE_CHECKING:
@@ -24,6 +29,7 @@ MOST_PROBES = 3000  # points at which a body's field is compared with the fluid 
 QUADRATURE_BITS = 8  # binary digits of the number of points in a cube around each; half of them are within the support
 PROBES_AT_A_TIME = 1000  # the distances of some hundred points around each are asked for together: 6 MiB of points
 OUTWARD_ROUNDS = 4  # steps by which points of the surface are moved out to where particles touch it
+REACH_ROOM = 1.05  # what a smooth way between samples of an animation may lead beyond them
 LEAST_FACTOR = (
     0.25  # at the usual support: amid a sheet of such samples there is 6/4 of the rest density, so none passes
 )
@@ -46,6 +52,11 @@ class FluidRigidCoupling(Coupling):
         self.bodies = (fluid.name, rigid.name)
         self._fluid, self._rigid = fluid, rigid
         self.force: NDArray[np.float64] = np.zeros((len(rigid.bodies), 3))
+        self._deforming = [
+            DeformingSamples(fluid.tank.boundary, number, geometry, deformation, fluid.tank.discretization)
+            for number, geometry in enumerate(rigid.solids)
+            if (deformation := geometry.deformation) is not None
+        ]
         self.follow(0.0)
 
     def exchange(self, dt: float) -> None:
@@ -57,6 +68,8 @@ class FluidRigidCoupling(Coupling):
     def follow(self, dt: float) -> None:
         """Put the fluid's samples where the bodies are after a substep of dt [s]; 0 before the first."""
         bodies = self._rigid.bodies
+        for samples in self._deforming:
+            samples.follow(self._rigid.time_s)
         states = BodyStates(bodies.position, bodies.rotation(), bodies.velocity, bodies.angular_velocity)
         self._fluid.tank.move_bodies(states, elapsed_s=dt)
         self.resume()
@@ -73,12 +86,60 @@ def samples_of_moving_bodies(
 ) -> BoundarySamples:
     """Samples of every moving body, relative to its centre of mass and in its axes."""
     samples = []
-    for index in range(len(rigid.bodies)):
-        surface, signed_distance = rigid.solids[index].samples(spacing), rigid.solids[index].signed_distance
+    for geometry in rigid.solids:
+        surface, signed_distance = geometry.samples(spacing), geometry.signed_distance
+        deformation = geometry.deformation
+        if deformation is not None:  # where its surface is largest, so that they are nowhere too far apart
+            solid = deformation.solid(deformation.widest)
+            surface, signed_distance = sample_surface(solid.mesh, spacing).astype(np.float64), solid.signed_distance
         sunk = sink_samples(surface, signed_distance, spacing, support_in_spacings)
         factors = completing_factors(sunk, surface, signed_distance, spacing, support_in_spacings)
+        if deformation is not None:
+            attached = deformation.attach(sunk.positions.astype(np.float64), deformation.widest)
+            at_start = attached.at(deformation.vertices(0.0)[0]) - geometry.centre_of_mass
+            sunk = replace(sunk, positions=at_start.astype(np.float32))
         samples.append(sunk.scaled(factors))
     return BoundarySamples.of_bodies(*samples)
+
+
+class DeformingSamples:
+    """The samples of a body that deforms: each keeps its place under the triangle that it is nearest to at the start.
+
+    Their volumes are those of the samples of the animation, and linear in between: what a surface gains by stretching
+    its samples gain.
+    """
+
+    def __init__(
+        self,
+        boundary: Boundary,
+        body: int,
+        geometry: BodyGeometry,
+        deformation: Deformation,
+        discretization: Discretization,
+    ) -> None:
+        """Take those that a boundary has of a body of this number."""
+        self._boundary, self._body, self._deformation = boundary, body, deformation
+        rows = slice(boundary.body_start[body], boundary.body_start[body + 1])
+        own = BoundarySamples(*(getattr(boundary.moving, field.name)[rows] for field in fields(BoundarySamples)))
+        attached = deformation.attach(own.positions.astype(np.float64) + geometry.centre_of_mass)
+        self._track = deformation.track(lambda vertices: attached.at(vertices) - geometry.centre_of_mass)
+        boundary.reach[body] = REACH_ROOM * float(np.linalg.norm(self._track.values, axis=2).max(initial=0.0))
+
+        @lru_cache(maxsize=2)
+        def volumes(sample: int) -> NDArray[np.float64]:
+            placed = replace(own, positions=self._track.values[sample].astype(np.float32))
+            return placed.volumes(discretization.spacing, discretization.support_in_spacings)
+
+        self._volumes = volumes
+
+    def follow(self, time_s: float) -> None:
+        """Put them where the surface is at a time [s]."""
+        position, velocity = self._track.at(time_s)
+        sample, share = self._track.interval(time_s)
+        volume = self._volumes(sample)
+        if share > 0.0:
+            volume = volume + share * (self._volumes(sample + 1) - volume)
+        self._boundary.deform(self._body, position, velocity, volume)
 
 
 def least_factor(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:

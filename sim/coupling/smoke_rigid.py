@@ -1,18 +1,19 @@
 """Rigid bodies that move through smoke."""
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import taichi as ti
 
 from sim.core.arrays import Matrices, Vectors
-from sim.core.bundles import bundle
+from sim.core.bundles import bundle, func
 from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.motion.paths import ArcLength, Path
 from sim.core.solver import Coupling
-from sim.shapes.device_shapes import DeviceShapes, Shapes, distance_to
+from sim.shapes.device_shapes import DeviceShapes, Shapes, distance_to, surface_motion
 from sim.smoke.lanes import Grid, row_start
 from sim.smoke.obstacles import Marks, mark, time_of_travel
 
@@ -34,7 +35,8 @@ class Bodies(NamedTuple):
 
 
 class SmokeRigidCoupling(Coupling):
-    """Bodies are obstacles for the air, and push it with the velocity of their surface, v + omega x r.
+    """Bodies are obstacles for the air, and push it with the velocity of their surface, v + omega x r + u; u where it
+    deforms.
 
     One way: bodies do not feel the air. Its density is a thousandth of theirs, and a smoke of constant density has no
     pressure in pascals to give. The smoke takes its own steps; before each, bodies go ahead to its end, and the cells
@@ -56,6 +58,7 @@ class SmokeRigidCoupling(Coupling):
         self.bodies = (rigid.name, smoke.name)
         self._rigid, self._smoke = rigid, smoke
         shapes, count = DeviceShapes(rigid.solids), len(rigid.solids)
+        self._shapes = shapes
         position, velocity, spin = (ti.Vector.ndarray(3, ti.f32, count) for _ in range(3))
         rotation = ti.Matrix.ndarray(3, 3, ti.f32, count)
         self._bodies = Bodies(shapes.on_device, shapes.centre_of_mass, position, rotation, velocity, spin)
@@ -86,13 +89,18 @@ class SmokeRigidCoupling(Coupling):
         if known is None or known[0] is not path:
             geometry = self._rigid.solids[number]
             reach = float(np.linalg.norm(geometry.centre_of_mass)) + geometry.radius
-            known = self._ways[number] = (path, path.arc_length(reach))
+            way, deformation = path.arc_length(reach), geometry.deformation
+            if deformation is not None:
+                # As if it deformed at its fastest until it ends.
+                way = replace(way, lengths=way.lengths + deformation.largest_speed * (way.times - way.times[0]))
+            known = self._ways[number] = (path, way)
         return known[1]
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that the bodies fill at the end of a step of the smoke of dt [s]."""
         bodies, grid, obstacles = self._rigid.bodies, self._smoke.grid, self._smoke.obstacles
         turned = bodies.rotation()
+        self._shapes.deform(self._rigid.time_s, 1.0)
         for array, values in (
             (self._bodies.position, bodies.position),
             (self._bodies.rotation, turned),
@@ -111,6 +119,29 @@ class SmokeRigidCoupling(Coupling):
             if all(begin <= end for begin, end in zip(low, high, strict=True)):
                 window = ti.math.ivec3(low), ti.math.ivec3(high), ti.math.vec3(grid.origin), grid.cell_size
                 _mark_body(number, *window, obstacles.box, obstacles.marks, self._bodies)
+
+
+@func
+def deforming_velocity(place: ti.math.vec3, body: ti.i32, cell_size: ti.f32, bodies: Bodies) -> ti.math.vec3:
+    """Velocity by which a cell of a body, about a place in its frame, moves as the body deforms.
+
+    Components are those on the faces to air, where they act: what spreads is faster there than half a cell deeper, and
+    a growing body would push less air than it gains. Rigid motions do not change along their own direction.
+    """
+    velocity = ti.math.vec3(0.0)
+    turned = bodies.rotation[body]
+    for axis in ti.static(range(3)):
+        way = ti.math.vec3(0.0)
+        for column in ti.static(range(3)):
+            way[column] = cell_size * turned[axis, column]
+        shift = 0.0
+        for side in range(2):
+            sign = 1.0 - 2.0 * float(side)
+            if distance_to(place + sign * way, body, bodies.shapes) >= 0.0:
+                shift += 0.5 * sign
+        moved = surface_motion(place + shift * way, body, bodies.shapes)
+        velocity[axis] = (turned @ moved)[axis]
+    return velocity
 
 
 @kernel
@@ -132,4 +163,6 @@ def _mark_body(
             place = bodies.rotation[body].transpose() @ arm + bodies.centre_of_mass[body]
             if distance_to(place, body, bodies.shapes) < 0.0:
                 velocity = bodies.velocity[body] + bodies.spin[body].cross(arm)
+                if ti.static(bodies.shapes.deforms):
+                    velocity += deforming_velocity(place, body, cell_size, bodies)
                 mark(marks, row_start(box, i, j) + k, velocity)

@@ -103,6 +103,8 @@ class Boundary:
         index: row in the fixed samples given of each fixed sample here, (fixed,), on the host.
         body_start: first moving sample of each body, (bodies + 1,), on the host.
         reach: largest distance of a sample from the centre of mass of its body [m], (bodies,), on the host.
+        moving: the samples of moving bodies as they were given.
+        deforming_speed: largest speed of samples in the frame of their body [m/s], (bodies,), on the host.
         moving_index: index of each of the sorted moving samples, (moving,), on the device.
     """
 
@@ -157,7 +159,13 @@ class Boundary:
             states=ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH),
         )
         self.sheets = Sheets(self.fixed_count + self.body_sample_count, self.body_sample_count, self.sheet_count)
-        self._offset = on_device(moving.positions)
+        self._offset, self.moving = on_device(moving.positions), moving
+        self._host_offset = self._reference_offset = moving.positions
+        self._own_velocity: ti.Ndarray | None = None  # of samples in the frame of their body, as soon as some deform
+        self._host_own_velocity = np.zeros_like(moving.positions)
+        self._host_volume = volumes[self.fixed_count : self.fixed_count + self.body_sample_count].astype(np.float32)
+        self._deformed_by = 0.0
+        self.deforming_speed: NDArray[np.float64] = np.zeros(body_count)
         self.body_start: NDArray[np.int64] = np.searchsorted(moving.body, np.arange(body_count + 1))
         distance = np.linalg.norm(moving.positions.astype(np.float64), axis=1)
         self.reach: NDArray[np.float64] = np.array(
@@ -176,6 +184,41 @@ class Boundary:
         """Samples of walls, of all bodies and of sheets."""
         return self.fixed_count + self.moving_count
 
+    def deform(
+        self,
+        body: int,
+        position: NDArray[np.floating],
+        velocity: NDArray[np.floating],
+        volume: NDArray[np.floating],
+    ) -> None:
+        """Say where the samples of a body are in its frame [m], (m, 3), how they move there, and their volumes [m³].
+
+        `place` puts them there.
+        """
+        rows = slice(self.body_start[body], self.body_start[body + 1])
+        offset, own_velocity, volumes = (
+            each.copy() for each in (self._host_offset, self._host_own_velocity, self._host_volume)
+        )
+        offset[rows], own_velocity[rows], volumes[rows] = position, velocity, volume
+        moved = offset[rows].astype(np.float64) - self._host_offset[rows]
+        self._deformed_by = max(self._deformed_by, float(np.linalg.norm(moved, axis=1).max(initial=0.0)))
+        self.deforming_speed[body] = np.linalg.norm(velocity, axis=1).max(initial=0.0)
+        self._put_deformed(offset, own_velocity, volumes)
+
+    def _put_deformed(
+        self,
+        offset: NDArray[np.generic],
+        own_velocity: NDArray[np.generic],
+        volumes: NDArray[np.generic],
+    ) -> None:
+        if self._own_velocity is None:
+            self._own_velocity, self._volume = on_device(self._host_own_velocity), on_device(self._host_volume)
+        self._host_offset, self._host_own_velocity, self._host_volume = offset, own_velocity, volumes
+        put(self._offset, offset)
+        put(self._own_velocity, own_velocity)
+        put(self._volume, volumes)
+        put_volumes(self._volume, self.bodies, self.samples)
+
     def place(self, states: BodyStates) -> float:
         """Put the moving samples where their bodies are; returns the largest displacement of one [m]."""
         if not self.body_count:
@@ -189,11 +232,15 @@ class Boundary:
         moved = (self._host_states.astype(np.float64) - before).reshape(-1, STATE_WIDTH)
         # Two rotations by an angle a apart differ by 2 sqrt(2) sin(a/2), and points at a distance of 1 by 2 sin(a/2).
         turned = np.linalg.norm(moved[:, 3:12], axis=1) / math.sqrt(2.0)
-        return float((np.linalg.norm(moved[:, :3], axis=1) + turned * self.reach).max())
+        deformed_by, self._deformed_by = self._deformed_by, 0.0
+        return float((np.linalg.norm(moved[:, :3], axis=1) + turned * self.reach).max()) + deformed_by
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:
         """Where the bodies and sheets are, and where they were when the moving samples were sorted last."""
         arrays = {"body_states": self.bodies.states.to_numpy(), "reference_body_states": self._reference_states.copy()}
+        if self._own_velocity is not None:
+            arrays["body_offsets"], arrays["reference_body_offsets"] = self._host_offset, self._reference_offset
+            arrays["body_offset_velocities"], arrays["body_volumes"] = self._host_own_velocity, self._host_volume
         if self.sheet_count:
             own = slice(self.sheets.first, self.count)
             arrays["sheet_position"] = self.samples.position.to_numpy()[own].copy()
@@ -203,12 +250,19 @@ class Boundary:
 
     def restore_reference(self, arrays: Arrays) -> None:
         """Put bodies and sheets where they were when the moving samples were sorted before the checkpoint."""
+        if self._own_velocity is not None:
+            self._put_deformed(
+                arrays["reference_body_offsets"], arrays["body_offset_velocities"], arrays["body_volumes"]
+            )
         self._place(arrays["reference_body_states"])
         if self.sheet_count:
             self._put_sheets(self.samples.position, arrays["reference_sheet_position"])
 
     def restore(self, arrays: Arrays) -> None:
         """Put bodies and sheets where they were at the checkpoint."""
+        if self._own_velocity is not None:
+            self._put_deformed(arrays["body_offsets"], arrays["body_offset_velocities"], arrays["body_volumes"])
+            self._deformed_by = 0.0
         self._place(arrays["body_states"])
         if self.sheet_count:
             self._put_sheets(self.samples.position, arrays["sheet_position"])
@@ -223,12 +277,14 @@ class Boundary:
         self._host_states = np.ascontiguousarray(states)
         put(self.bodies.states, self._host_states)
         place_samples(self._offset, self.bodies, self.samples)
+        if self._own_velocity is not None:
+            add_own_velocities(self._own_velocity, self.bodies, self.samples)
 
     def sort_moving(self) -> SortedPoints | None:
         """Sort the moving samples by cell, where they are now, into `moving_index` too; None where there are none."""
         if self._moving_cells is None or self._moving_points is None:
             return None
-        self._reference_states = self._host_states
+        self._reference_states, self._reference_offset = self._host_states, self._host_offset
         sort_moving_samples(
             self.samples,
             self.fixed_count,
@@ -268,6 +324,28 @@ def place_samples(offset: Vectors, bodies: Bodies, samples: Samples):
         spin = ti.math.vec3(bodies.states[s + 15], bodies.states[s + 16], bodies.states[s + 17])
         samples.position[bodies.first + b] = centre + arm
         samples.velocity[bodies.first + b] = speed + spin.cross(arm)
+
+
+@kernel
+def add_own_velocities(own: Vectors, bodies: Bodies, samples: Samples):
+    """v_b += R u_b, where surfaces deform."""
+    for b in range(bodies.sample_count):
+        s = bodies.body[b] * STATE_WIDTH
+        u = own[b]
+        for row in ti.static(range(3)):
+            samples.velocity[bodies.first + b][row] += (
+                bodies.states[s + 3 + 3 * row] * u[0]
+                + bodies.states[s + 4 + 3 * row] * u[1]
+                + bodies.states[s + 5 + 3 * row] * u[2]
+            )
+
+
+@kernel
+def put_volumes(volumes: Floats, bodies: Bodies, samples: Samples):
+    """V_b of the samples of bodies."""
+    for b in range(bodies.sample_count):
+        samples.volume[bodies.first + b] = volumes[b]
+        samples.friction_volume[bodies.first + b] = volumes[b]
 
 
 @kernel

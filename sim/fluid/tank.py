@@ -183,6 +183,7 @@ class ParticleTank:
         self._place_bodies()
         spin = np.linalg.norm(states.angular_velocity, axis=1)
         speed = np.linalg.norm(states.velocity, axis=1) + spin * self.boundary.reach[: len(spin)]
+        speed += self.boundary.deforming_speed[: len(spin)]
         self.body_speed = float(speed.max(initial=0.0))
         self._without_neighbors |= elapsed_s == 0.0
 

@@ -30,6 +30,7 @@ STEPS_AHEAD, ROOM = 5.0, 0.05
 """Near pairs are searched for with room for the motion of so many steps, and for a part of their shortest edges."""
 LARGEST_WORK = 1 << 25  # numbers that pairs need which a GPU looks at side by side
 MOST_BLOCKS = 1 << 14  # of these pairs
+ANY_BUDGET = 1.0e12  # motion that uses up what any pair has [m]
 HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio
 COLUMNS = {"pairs": 4, "features": 2, "planes": 6, "balls": 4, "forces": 3, "bodies": 2, "point": 3, "normal": 3}
 """Of arrays of pairs and of contacts."""
@@ -39,8 +40,8 @@ class CollisionDetector:
     """Finds the contacts of bodies with each other and with walls.
 
     Bodies are numbered: moving ones, static ones, and last the domain, which stands still at the origin. A pair is
-    examined again when its surfaces may have moved by more than `TRUSTED_MOTION`; until then its contacts are followed
-    (`collision_kernels.Kept`), all within that distance included.
+    examined again when its surfaces may have moved by more than `TRUSTED_MOTION`, or one deforms; until then its
+    contacts are followed (`collision_kernels.Kept`), all within that distance included.
 
     Attributes:
         deepest: overlap that was found last [m].
@@ -59,6 +60,7 @@ class CollisionDetector:
         self._centre = np.stack([geometry.bounds.mean(axis=0) for geometry in geometries])
         self._half_edges = np.stack([0.5 * np.ptp(geometry.bounds, axis=0) for geometry in geometries])
         self._size = np.array([*(geometry.shortest_edge for geometry in geometries), kernels.FAR])
+        self._deforms = np.array([*(geometry.deformation is not None for geometry in geometries), False])
         self._untouching = np.zeros(0, dtype=np.int64)
         self._pairs, self._outer = np.zeros((0, 4), dtype=np.int32), np.zeros((self._domain, 6))
         self._moved, self._must_search, self._is_renewed = np.zeros(self._domain + 1), True, False
@@ -118,15 +120,15 @@ class CollisionDetector:
             fill(getattr(self._kept, name), np.array(arrays[f"contact_{name}"]))
         fill(self._near.before, np.arange(len(pairs), dtype=np.int32))
 
-    def find(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> None:
-        """Find the contacts of all active bodies in poses.
+    def find(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_], time_s: float = 0.0) -> None:
+        """Find the contacts of all active bodies in poses, and in the shapes that they have at a time [s].
 
         The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the step
         before are preferred among equals. Contacts of bodies that are not active are kept.
         """
         self.look(poses, motion)
         bodies, count = self._bodies, len(self._pairs)
-        put(bodies.moved, self._moved)
+        put(bodies.moved, np.where(self._deforms, ANY_BUDGET, self._moved))
         put(bodies.is_active, np.append(is_active, False))
         self._moved = np.zeros(self._domain + 1)
         self._was_active, self._total, self.deepest = is_active, 0, 0.0
@@ -134,6 +136,7 @@ class CollisionDetector:
             return
         near, walls = self._near, self.walls
         tasks = kernels.choose_pairs(count, bodies, near, walls)
+        self._shapes.deform(time_s)
         rows = tasks * kernels.MOST_KEPT
         self._found = larger_tables(kernels.Found, self._found, COLUMNS, rows, counts=tasks, clearances=tasks)
         if self._kept is None:

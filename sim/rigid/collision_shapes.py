@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.host_access import put
 from sim.rigid import collision_kernels as kernels
 from sim.rigid.contacts import FEATURE_BITS, WALL_BITS, Array, Indices
 from sim.rigid.polytope_kernels import Polytopes
 from sim.rigid.polytopes import Polytope, polytope_of
 from sim.rigid.tables import kept
+from sim.shapes.balls import Balls
 from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.deformation import Deformation
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 from sim.shapes.revolved import Revolved
 from sim.shapes.solid import ShapeError
@@ -70,14 +73,20 @@ class CollisionShapes:
                 size[kernels.ORIGIN :][:3], size[kernels.SPACING] = grid.origin, grid.spacing
                 size[kernels.SLANT] = SLANT_ON_GRIDS
                 values.append(grid.values.ravel())
-            own = _in_clusters(geometry)
+            own = _in_clusters(geometry.balls)
             row[kernels.FIRST_BALL], row[kernels.BALLS] = sum(map(len, balls)), len(own)
             groups = _clusters_of(own)
             row[kernels.FIRST_CLUSTER], row[kernels.CLUSTERS] = sum(map(len, clusters)), len(groups)
             balls.append(own)
             clusters.append(groups)
-        tables = (whole, sizes, *(np.concatenate(parts) for parts in (balls, clusters, values, edges)))
+        tables = kernels.Shapes(whole, sizes, *(np.concatenate(parts) for parts in (balls, clusters, values, edges)))
         self.on_device = kernels.Shapes(*map(kept, tables))
+        self._deforming = [
+            _DeformingShape(number, geometry.deformation, geometry.centre_of_mass, tables)
+            for number, geometry in enumerate(shapes)
+            if geometry.deformation is not None
+        ]
+        self._tables, self._time_s = tables, -np.inf
         self.most_balls = int(whole[:, kernels.BALLS].max())
         if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
             raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
@@ -97,6 +106,16 @@ class CollisionShapes:
     def has_others(self) -> bool:
         """Whether there is another shape."""
         return not self._is_polytope.all()
+
+    def deform(self, time_s: float) -> None:
+        """Take shapes that deform as they are at a time [s]."""
+        if not self._deforming or time_s == self._time_s:
+            return
+        self._time_s = time_s
+        for shape in self._deforming:
+            shape.put_into(self._tables, time_s)
+        for name in ("balls", "clusters", "values"):
+            put(getattr(self.on_device, name), getattr(self._tables, name))
 
     def sides(self, first: Indices, second: Indices) -> NDArray[np.int32]:
         """Whose balls are to be looked at in pairs of bodies: 1 the first's, 2 the second's, 3 both, (k,).
@@ -139,9 +158,32 @@ def _sides(one: BodyGeometry, two: BodyGeometry) -> int:
     return 2 if two.sees_all_contacts_with(one) else 3
 
 
-def _in_clusters(geometry: BodyGeometry) -> Array:
+class _DeformingShape:
+    """One of the shapes of the tables, whose balls are fixed to its surface and whose distances change."""
+
+    def __init__(self, number: int, deformation: Deformation, centre: Array, tables: kernels.Shapes) -> None:
+        row = tables.whole[number]
+        self._deformation, self._centre, self._first_value = deformation, centre, int(row[kernels.FIRST_VALUE])
+        first, count = int(row[kernels.FIRST_BALL]), int(row[kernels.BALLS])
+        self._balls = slice(first, first + count)
+        self._clusters = slice(row[kernels.FIRST_CLUSTER], row[kernels.FIRST_CLUSTER] + row[kernels.CLUSTERS])
+        own = tables.balls[self._balls]
+        self._attachment, self._axes = deformation.attach(own[:, :3] + centre), own[:, 4:7].copy()
+        self._rest = deformation.vertices(-np.inf)[0]
+
+    def put_into(self, tables: kernels.Shapes, time_s: float) -> None:
+        """Note in the tables where the shape is at a time [s]."""
+        vertices, _ = self._deformation.vertices(time_s)
+        own = tables.balls[self._balls]
+        own[:, :3] = self._attachment.at(vertices) - self._centre
+        own[:, 4:7] = self._attachment.turned(self._rest, vertices, self._axes)
+        tables.clusters[self._clusters] = _clusters_of(own)
+        values = self._deformation.level_set(time_s).values.ravel()
+        tables.values[self._first_value : self._first_value + len(values)] = values
+
+
+def _in_clusters(balls: Balls) -> Array:
     """The balls of a shape, (m, 8), neighbours together: the leaves of a tree that halves them by median."""
-    balls = geometry.balls
     table = np.concatenate([balls.centres.T, balls.radii[:, None], balls.axes.T, balls.cones[:, None]], axis=1)
     order: list[Indices] = []
     stack = [np.arange(len(table))]

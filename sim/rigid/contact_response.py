@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,10 @@ from sim.rigid.contact_solver import (
     MAX_ITERATIONS,
     NO_IMPULSES,
     NO_LINKS,
+    NOT_CARRIED,
     RELATIVE_TOLERANCE,
     Apart,
+    Carried,
     ContactSystem,
     Solution,
     solve_velocities,
@@ -69,8 +72,8 @@ class ContactResponse:
     """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
 
     Attributes:
-        in_colours: whether contacts that neither bounce nor have joints beside them are solved by a `Pile`, many side
-            by side: on GPUs, where islands would be solved by a thread each.
+        in_colours: whether contacts that neither bounce nor have joints, or what deforms, beside them are solved by a
+            `Pile`, many side by side: on GPUs, where islands would be solved by a thread each.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
@@ -86,11 +89,13 @@ class ContactResponse:
         ease: Array,
         joints: Joints | None = None,
         step: JointStep | None = None,
+        carried: Callable[[Contacts], Carried] | None = None,
     ) -> Outcome:
         """Change the velocities of active bodies, (n,), so that contacts hold, bounce and rub over a step of dt [s].
 
         A detector has found their contacts. How easily impulses move bodies, and that others do not, is
-        `ContactSystem.ease`; joints, with their step, hold where contacts are.
+        `ContactSystem.ease`; joints, with their step, hold where contacts are; where surfaces deform, they carry some
+        contacts.
 
         A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
         """
@@ -101,15 +106,16 @@ class ContactResponse:
             return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still)
         if self.in_colours is None:
             self.in_colours = runs_on_gpu()
-        if self.in_colours and step is None and not self._surfaces.restitution.any():
+        if self.in_colours and step is None and carried is None and not self._surfaces.restitution.any():
             return self._resolve_pile(detector, bodies, dt, ease)
         contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
-        system = ContactSystem.build(contacts, bodies.position, ease, links)
+        led = NOT_CARRIED if carried is None else carried(contacts)
+        system = ContactSystem.build(contacts, bodies.position, ease, links, led)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
-        before = np.zeros((n + 1, 6))
-        before[:n, :3], before[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        before = np.zeros((len(system.ease), 6))
+        before[:n, :3], before[:n, 3:], before[n + 1 :, :3] = bodies.velocity, bodies.angular_velocity, led.velocity
         of_impacts, of_step, by_joints = None, None, NO_IMPULSES
         if joints is not None and step is not None:
             of_impacts, of_step = joints.impacts(step), joints.velocities(step)
@@ -132,17 +138,17 @@ class ContactResponse:
         )
         bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3].copy(), solution.velocity[:n, 3:].copy()
 
-        touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
+        touched, held = np.zeros(len(system.ease), dtype=bool), np.zeros(len(system.ease), dtype=bool)
         pushed = solution.impulses[:, 0] != 0.0
         for axis in (1, 2):
             pushed |= solution.impulses[:, axis] != 0.0
         pushed |= impacts.impulses.any(axis=1)
-        is_free = np.append(bodies.is_free, False)[system.bodies]
+        is_free = bodies.are_free(system.bodies)
         for side in range(2):
             touched[system.bodies[pushed, side]] = True
             held[system.bodies[pushed & ~is_free[:, 1 - side], side]] = True
         return Outcome(
-            solution.extra,
+            solution.extra[: n + 1],
             touched[:n],
             held[:n],
             solution.impulses / dt,

@@ -21,6 +21,18 @@ RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep m
 
 
 @dataclass(frozen=True, eq=False)
+class Carried:
+    """Sides of contacts on surfaces that deform: there they meet a point of the surface, which is led by it."""
+
+    rows: Indices  # numbers of the contacts, (c,)
+    sides: Indices  # 0 for the first body of each, 1 for the second
+    velocity: Array  # of the surface [m/s], (c, 3)
+
+
+NOT_CARRIED = Carried(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
 class ContactSystem:
     """The linear relation between impulses at contacts and velocities there.
 
@@ -32,18 +44,27 @@ class ContactSystem:
     point: Array  # [m], (k, 3)
     normal: Array  # from the second to the first, (k, 3)
     bodies: NDArray[np.int32]  # numbers of the two bodies, n where one does not belong to those that move, (k, 2)
-    position: Array  # of the moving bodies and of one that stands still [m], (n + 1, 3)
-    ease: Array  # of these, inverse mass and inertia: xx, xy, xz, yy, yz, zz, (n + 1, 7)
+    position: Array  # of the moving bodies, of one that stands still, and of c that surfaces carry [m], (n + 1 + c, 3)
+    ease: Array  # of these, inverse mass and inertia: xx, xy, xz, yy, yz, zz, (n + 1 + c, 7)
     islands: Indices  # numbers of the groups of contacts that hang together, (k,)
-    island_of_bodies: Indices  # likewise of bodies, -1 of those that no contact, or no impulse, moves, (n + 1,)
+    island_of_bodies: Indices  # likewise of bodies, -1 of those that no contact, or no impulse, moves, (n + 1 + c,)
     links: Indices  # pairs of bodies that joints link, (l, 2)
 
     @classmethod
-    def build(cls, contacts: Contacts, position: Array, ease: Array, links: Indices = NO_LINKS) -> ContactSystem:
+    def build(
+        cls,
+        contacts: Contacts,
+        position: Array,
+        ease: Array,
+        links: Indices = NO_LINKS,
+        carried: Carried = NOT_CARRIED,
+    ) -> ContactSystem:
         """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
-        n = len(position)
+        n, c = len(position), len(carried.rows)
         bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n).astype(np.int32)
-        position = np.concatenate([position, np.zeros((1, 3))])
+        bodies[carried.rows, carried.sides] = n + 1 + np.arange(c)
+        ease = np.concatenate([ease, np.zeros((c, 7))])
+        position = np.concatenate([position, np.zeros((1, 3)), contacts.point[carried.rows]])
         islands = _islands(bodies, ease[:, 0] > 0.0, links)
         return cls(contacts.point, contacts.normal, bodies, position, ease, *islands, links)
 

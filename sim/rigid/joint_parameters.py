@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
 
 RIGID_KINDS = ("fixed", "hinge", "slider", "ball")
 """Kinds that hold two bodies at one point; the others hold two points."""
@@ -181,16 +182,27 @@ def points_of(joint: JointParameters, bodies: Sequence[RigidBodyParameters]) -> 
     if joint.kind in RIGID_KINDS:
         point = joint.anchor
         if point is None:
-            point = next(body.position for body in bodies if body.name == joint.between[0])
+            point = next(_place_of(body) for body in bodies if body.name == joint.between[0])
         return point, point
     if joint.anchors is not None:
         return joint.anchors
-    first, second = ({body.name: body.position for body in bodies}[name] for name in joint.between)
+    by_name = {body.name: body for body in bodies}
+    first, second = (_place_of(by_name[name]) for name in joint.between)
     return first, second
 
 
-def joint_problems(joints: Sequence[JointParameters], bodies: Sequence[RigidBodyParameters]) -> Iterator[JointProblem]:
-    """Joints that cannot be, of bodies that may not be there."""
+def _place_of(body: RigidBodyParameters) -> Vector3:
+    """Where the origin of a body's shape is at the start [m]; that of one that a file animates is in the file."""
+    if body.shape.type != "animation":
+        return body.position
+    x, y, z = path_of(body).at(0.0).position.tolist()
+    return x, y, z
+
+
+def joint_problems(
+    joints: Sequence[JointParameters], bodies: Sequence[RigidBodyParameters], cloths: Collection[str] = ()
+) -> Iterator[JointProblem]:
+    """Joints that cannot be, of bodies that may not be there; cloths by name."""
     kinds = {body.name: body.kind for body in bodies}
     names: dict[str, int] = {}
     held: dict[frozenset[str], list[JointParameters]] = {}
@@ -199,6 +211,12 @@ def joint_problems(joints: Sequence[JointParameters], bodies: Sequence[RigidBody
             yield JointProblem(number, "name", f'"{joint.name}" is taken by joint[{names[joint.name]}]; take another')
         names.setdefault(joint.name, number)
         if unknown := [name for name in joint.between if name not in kinds]:
+            if unknown[0] in cloths:
+                sentence = (
+                    f'names the cloth "{unknown[0]}", and joints hold rigid bodies alone; let the cloth lie on one'
+                )
+                yield JointProblem(number, "between", sentence)
+                continue
             known = f"rigid bodies are {', '.join(kinds)}" if kinds else "add [[rigid]]"
             yield JointProblem(number, "between", f'names no rigid body with "{unknown[0]}"; {known}')
             continue

@@ -28,6 +28,7 @@ HOLDS, LIMITS, DRIVES, PULLS = range(4)
 MOST_STEPS = 20  # of Newton's method to where the joints hold at the end of a step
 HELD = 1.0e-9  # change of a gap [m], [rad] by which these steps end: what is left is far less
 APART = 1.0e-6  # error that no impulse changes: what joints ask for is more than there is to move [m], [rad]
+FIGHTS = 0.1  # of the largest error of a joint, from which on others fight with it
 DIVERGES = 4.0  # growth from one of these steps to another with which they end
 CLOSING_SHARE = 0.2  # of an error at the start of a step that is taken back in it
 TOUCHING = 1.0e-6  # a limit nearer than this counts as reached in an impact [m], [rad]
@@ -401,7 +402,11 @@ class Joints:
         if holds.any():
             errors = np.where(holds, np.abs(values), 0.0)
             self._gap_m = max(self._gap_m, float(errors.max()))
-        self._apart += not hold.converged
+        if not hold.converged:
+            self._apart += 1
+            worst = np.zeros(len(self))
+            np.maximum.at(worst, self._joint, np.where(system.is_there & (does == HOLDS), np.abs(values), 0.0))
+            self._apart_of += (worst > APART) & (worst >= FIGHTS * worst.max())
 
     def _break(self, before: JointSystem, first: Array, after: JointSystem, last: Array, dt: float) -> None:
         """Break joints whose mean force or torque over a step of dt [s] was too large."""
@@ -437,11 +442,16 @@ class Joints:
 
     def begin_frame(self) -> None:
         """A frame starts: reset its counters."""
-        self._gap_m, self._apart = 0.0, 0
+        self._gap_m, self._apart, self._apart_of = 0.0, 0, np.zeros(len(self), dtype=np.int64)
 
     def diagnostics(self) -> Diagnostics:
-        """The largest gap of a joint in the frame [m], steps that did not find where all hold, and joints broken."""
+        """The largest gap of a joint in the frame [m], steps that did not find where all hold, and joints broken.
+
+        `joints_apart_NAME` is in how many of these steps a joint was among those that gaped most.
+        """
+        of_joints = {f"joints_apart_{self.names[j]}": float(self._apart_of[j]) for j in np.flatnonzero(self._apart_of)}
         return {
+            **of_joints,
             "joint_gap": self._gap_m,
             "joints_apart": float(self._apart),
             "joints_broken": float(np.count_nonzero(self.is_broken)),

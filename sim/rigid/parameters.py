@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from math import prod
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, PrivateAttr, model_validator
 
 from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
 from sim.core.parameters import BodyName, Fraction, KeyRefusedError, NonNegative, Positive, Vector3
 from sim.rigid.group_parameters import CurveParameters, JitterParameters, ScatterParameters
-from sim.shapes.parameters import WeightedPlacement
+from sim.shapes.parameters import AnimationShape, WeightedPlacement
 
 MOST_OF_A_GROUP = 100_000
 PLACES = ("spacing", "along", "scatter")
@@ -24,6 +24,8 @@ class RigidBodyParameters(WeightedPlacement):
 
     A table with `count` is a group: its bodies share all other keys.
     """
+
+    may_be_animated: ClassVar[bool] = True
 
     name: BodyName = Field(description="Name of the body, unique in the job.")
     kind: Literal["static", "kinematic", "dynamic"] = Field(
@@ -173,6 +175,21 @@ class RigidBodyParameters(WeightedPlacement):
         if "interpolation" in given and not self.keyframe:
             raise ValueError("interpolation has no meaning without keyframes; remove it or add [[rigid.keyframe]]")
         require_ascending_times(self.keyframe)
+        return self
+
+    @model_validator(mode="after")
+    def _is_moved_by_its_file_alone(self) -> Self:
+        if not isinstance(self.shape, AnimationShape):
+            return self
+        if self.kind != "kinematic":
+            raise KeyRefusedError(("kind",), 'of a body that a file animates is "kinematic": nothing else moves it')
+        for key in ("velocity", "angular_velocity"):
+            if any(getattr(self, key)):
+                raise KeyRefusedError((key,), "of a body that a file animates comes from there; remove it")
+        if self.keyframe:
+            raise KeyRefusedError(("keyframe",), "cannot lead a body that a file animates; move it there, or remove it")
+        if self.count is not None:
+            raise KeyRefusedError(("count",), "cannot be of a body that a file animates; write a table for each")
         return self
 
     @model_validator(mode="after")

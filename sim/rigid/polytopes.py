@@ -33,7 +33,7 @@ class Polytope:
 def polytope_of(geometry: BodyGeometry) -> Polytope | None:
     """The polytope of a body, if it is one of few faces: as balls under its surface have it, edges are rounded."""
     shape = geometry.solid.shape
-    if not isinstance(shape, Box | MeshSolid):
+    if geometry.deformation is not None or not isinstance(shape, Box | MeshSolid):
         return None
     try:
         hull = ConvexHull(geometry.solid.rest_mesh().vertices - geometry.centre_of_mass)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,8 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
-from sim.rigid.contacts import Indices
+from sim.rigid.contact_solver import NOT_CARRIED, Carried
+from sim.rigid.contacts import Contacts, Indices
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
@@ -70,6 +72,7 @@ class RigidSolver:
         surfaces: friction and restitution of all of these.
         walls: closed faces of the domain.
         joints: between the bodies, or None.
+        deforming: deformations of the bodies that have one, by their number.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
         has_own_steps: whether fast bodies divide the step of all; nothing that is coupled to them shares it then.
 
@@ -95,6 +98,10 @@ class RigidSolver:
         self.bodies = _starting_bodies(parameters, self.solids)
         self._groups = tuple(body.group for body in parameters)
         self._centres = np.array([solid.centre_of_mass for solid in self.solids])
+        self.deforming = {
+            number: solid.deformation for number, solid in enumerate(self.solids) if solid.deformation is not None
+        }
+        self._animated = {n for n, body in enumerate(parameters) if body.shape.type == "animation"}
         self._place_kinematic_bodies(0.0)
 
         fixed = _geometries_of(obstacles)
@@ -199,9 +206,10 @@ class RigidSolver:
         ease = np.zeros((len(bodies) + 1, 7))
         bodies.describe(is_active, self._pose, ease)
         joints = self.joints
-        self._detector.find(self._poses_described(), reach, among)
+        self._detector.find(self._poses_described(), reach, among, time_s)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
-        outcome = self._response.resolve(self._detector, bodies, dt, ease, joints, step)
+        carried = partial(self._carried, time_s=time_s + 0.5 * dt) if self.deforming else None
+        outcome = self._response.resolve(self._detector, bodies, dt, ease, joints, step, carried)
         if outcome.forces is not None:
             self._detector.keep_forces(outcome.forces)
         self._contact_count = self._detector.active_count()
@@ -240,6 +248,23 @@ class RigidSolver:
             joints.settle(hold, bodies, is_active, bodies.inverse_inertia())
             if int(joints.is_broken.sum()) > broken:
                 self._obey_joints()
+
+    def _carried(self, contacts: Contacts, time_s: float) -> Carried:
+        """The sides of contacts that are on surfaces that deform, with their velocities at a time [s]."""
+        found = []
+        for number, deformation in self.deforming.items():
+            if self.bodies.deforming[number] == 0.0:
+                continue
+            turned, velocity = rotation.matrices(self.bodies.orientation[number]), self.bodies.velocity[number]
+            for side, own in enumerate((contacts.first, contacts.second)):
+                rows = np.flatnonzero(own == number)
+                if not len(rows):
+                    continue
+                arm = contacts.point[rows] - self.bodies.position[number]
+                of_surface = deformation.velocities(arm @ turned + self._centres[number], time_s) @ turned.T
+                led = velocity + rotation.cross(self.bodies.angular_velocity[number], arm) + of_surface
+                found.append((rows, np.full(len(rows), side), led))
+        return Carried(*map(np.concatenate, zip(*found, strict=True))) if found else NOT_CARRIED
 
     def _obey_joints(self) -> None:
         """Tell who looks for contacts, and who chooses steps, what joints hold together now."""
@@ -303,6 +328,8 @@ class RigidSolver:
         number = self.bodies.names.index(name) if name in self.bodies.names else -1
         if number not in self.paths:
             raise ValueError(f'no kinematic body is named "{name}"; only such bodies can be led')
+        if number in self.deforming:
+            raise ValueError(f'"{name}" deforms as its file has it, by time alone; nothing else can lead it')
         now = self.paths[number].at(self.time_s)
         self.paths[number] = path_onwards(now, self.time_s, position, rotation_deg, within_s)
         self._place_kinematic_bodies(self.time_s)  # couplings see how it moves from now on
@@ -369,6 +396,8 @@ class RigidSolver:
             self.bodies.orientation[number] = motion.orientation
             self.bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
             self.bodies.angular_velocity[number] = motion.angular_velocity
+        for number, deformation in self.deforming.items():
+            self.bodies.deforming[number] = deformation.speed(time_s)
 
     def _set_mean_velocities_of_kinematic_bodies(self, time_s: float, dt: float) -> None:
         """Contacts see how kinematic bodies will have moved by the end of the step of dt [s] from a time [s] on."""
@@ -388,20 +417,39 @@ class RigidSolver:
             self.bodies.angular_velocity[lost] = 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
-        """The pose of each body's own mesh at rest, and the velocity of the mesh's origin."""
+        """The pose of each body's own mesh at rest, and the velocity of the mesh's origin; of one that a file animates
+        the mesh as it is, too.
+        """
         bodies = self.bodies
         turned = bodies.rotation()
         snapshots = {}
         for number, name in enumerate(bodies.names):
             arm = -turned[number] @ self._centres[number]
-            arrays = {
+            arrays: dict[str, NDArray[np.generic]] = {
                 "position": bodies.position[number] + arm,
                 "orientation": bodies.orientation[number].copy(),
                 "velocity": bodies.velocity[number] + rotation.cross(bodies.angular_velocity[number], arm),
                 "angular_velocity": bodies.angular_velocity[number].copy(),
             }
+            if number in self._animated:
+                arrays |= self._mesh_of(number, arrays)
             snapshots[name] = Snapshot("rigid", arrays, {}, self._groups[number])
         return snapshots
+
+    def _mesh_of(self, number: int, pose: Mapping[str, Array]) -> dict[str, NDArray[np.generic]]:
+        """Vertices [m], (n, 3), how they move [m/s], and triangles, (m, 3), of a body with a pose."""
+        mesh = self.solids[number].solid.rest_mesh()
+        vertices, own_velocity = mesh.vertices, np.zeros_like(mesh.vertices)
+        if number in self.deforming:
+            vertices, own_velocity = self.deforming[number].vertices(self.time_s)
+        arms = rotation.rotated(pose["orientation"], vertices)
+        velocity = pose["velocity"] + rotation.cross(pose["angular_velocity"], arms)
+        velocity += rotation.rotated(pose["orientation"], own_velocity)
+        return {
+            "vertices": (pose["position"] + arms).astype(np.float32),
+            "vertex_velocities": velocity.astype(np.float32),
+            "triangles": mesh.faces.astype(np.int32),
+        }
 
     def view(self, body: str) -> dict[str, NDArray[np.generic]]:
         """Pose and velocities of a body, as in its snapshot: copies, of 13 numbers."""
@@ -497,7 +545,8 @@ class RigidSolver:
 
 def largest_dt(parameters: Sequence[RigidBodyParameters]) -> float:
     """Largest step [s] of these bodies, however slow they are."""
-    return LARGEST_DT if any(body.kind == "dynamic" or body.keyframe for body in parameters) else math.inf
+    has_path = (body.kind == "dynamic" or body.keyframe or body.shape.type == "animation" for body in parameters)
+    return LARGEST_DT if any(has_path) else math.inf
 
 
 _STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost", "is_asleep", "rest_s")

@@ -34,6 +34,7 @@ class MovingBodies:
         is_pushed: (n,) bool: got an impulse since the last step; the step that takes it in resets it.
         is_asleep: (n,) bool: rests, and is left alone until something that moves comes near, or an impulse wakes it.
         rest_s: for how long it has been too slow to be seen to move [s], (n,).
+        deforming: how fast points of its surface move in its own frame, at most [m/s], (n,).
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class MovingBodies:
         self.velocity, self.angular_velocity = velocity, angular_velocity
         self.is_dynamic = np.isfinite(self.mass)
         self.is_lost, self.is_pushed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-        self.is_asleep, self.rest_s = np.zeros(n, dtype=bool), np.zeros(n)
+        self.is_asleep, self.rest_s, self.deforming = np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
         self._inverse_tensor = np.zeros((n, 3, 3))
         self._inverse_tensor[self.is_dynamic] = np.linalg.inv(self._tensor[self.is_dynamic])
         self.principal_moments, axes = np.linalg.eigh(self._tensor)
@@ -140,7 +141,7 @@ class MovingBodies:
     def surface_speeds(self, radius: Array) -> Array:
         """Upper bounds of the speeds of surface points within a radius [m] of each body [m/s], (n,)."""
         spin = np.sqrt(np.square(self.angular_velocity).sum(axis=1))
-        speeds: Array = np.sqrt(np.square(self.velocity).sum(axis=1)) + spin * radius
+        speeds: Array = np.sqrt(np.square(self.velocity).sum(axis=1)) + spin * radius + self.deforming
         return speeds
 
     def wake(self, which: NDArray[np.bool_]) -> None:

@@ -72,7 +72,7 @@ class StepChooser:
         first, second = self._detector.overlapping(poses, motion, among)
 
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
-        turning = np.append(spin, np.zeros(len(self._edge) - n)) * self._radius
+        turning = np.append(spin * self._radius[:n] + bodies.deforming, np.zeros(len(self._edge) - n))
         all_speeds = np.append(own, np.zeros(len(self._edge) - n))
         relative = np.sqrt(np.square(velocity[first] - velocity[second]).sum(axis=1)) + turning[first] + turning[second]
         slower, faster = np.sort([all_speeds[first], all_speeds[second]], axis=0)
@@ -143,7 +143,7 @@ class StepChooser:
         self._detector.look(poses, motion)
         speeds = Speeds(
             np.concatenate([bodies.velocity, np.zeros((still, 3))]),
-            np.append(spin * self._radius[:n], np.zeros(still)),
+            np.append(spin * self._radius[:n] + bodies.deforming, np.zeros(still)),
             np.append(own, np.zeros(still)),
             np.append(self._advance, FAR),
             np.append(is_free, np.zeros(still)).astype(np.int32),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,12 @@ from sim.shapes.distance_grids import sampled_distances
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, mass_properties_of_solid
 from sim.shapes.mesh_solid import MeshSolid
-from sim.shapes.parameters import WeightedPlacement
+from sim.shapes.parameters import AnimationShape, WeightedPlacement
 from sim.shapes.placement import PlacedSolid, build_solid
 from sim.shapes.solid import Points
+
+if TYPE_CHECKING:
+    from sim.shapes.deformation import Deformation
 
 GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh
 GRID_PADDING = 0.1  # how far a distance grid reaches past its mesh, in longest edges
@@ -24,15 +28,19 @@ GRID_PADDING = 0.1  # how far a distance grid reaches past its mesh, in longest 
 class BodyGeometry:
     """A body at rest, in its frame: origin at the centre of mass, axes those of its mesh.
 
+    One that deforms is here as in its first sample, but for its box, which holds all that it ever fills.
+
     Attributes:
         solid: the scaled shape about its own origin, unturned.
         centre_of_mass: in the frame of `solid` [m], (3,).
+        deformation: of `solid`, in its frame; None if it is rigid.
     """
 
     def __init__(self, parameters: WeightedPlacement) -> None:
         """Build the shape; raises ShapeError where that is impossible, or it is too thin to have an inside."""
         placed = build_solid(parameters)
         self.solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
+        self.deformation = _deformation_of(parameters, placed)
         self._of_unit_density = _mass_properties(self.solid)
         self._ballast = parameters.ballast
         # Without ballast the centre is that of the shape, and bodies without mass have one too.
@@ -49,7 +57,8 @@ class BodyGeometry:
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lower and upper corner of its box [m], (2, 3)."""
-        return self.solid.bounds - self.centre_of_mass
+        bounds = self.solid.bounds if self.deformation is None else self.deformation.bounds
+        return bounds - self.centre_of_mass
 
     @cached_property
     def radius(self) -> float:
@@ -59,6 +68,8 @@ class BodyGeometry:
     @property
     def shortest_edge(self) -> float:
         """Shortest edge of its box [m]."""
+        if self.deformation is not None:
+            return self.deformation.shortest_edge
         return float(np.min(self.bounds[1] - self.bounds[0]))
 
     def signed_distance(self, points: Points) -> NDArray[np.float64]:
@@ -98,6 +109,8 @@ class BodyGeometry:
     @cached_property
     def grid(self) -> LevelSet:
         """Distances of a mesh as contacts read them, in the frame of `solid`."""
+        if self.deformation is not None:
+            return self.deformation.level_set(0.0)
         longest = float(np.max(self.bounds[1] - self.bounds[0]))
         return LevelSet.sample(self.solid, longest / GRID_CELLS, padding=GRID_PADDING * longest)
 
@@ -105,6 +118,17 @@ class BodyGeometry:
     def fine_grid(self) -> LevelSet:
         """Distances of a mesh as cloth and smoke read them, in the frame of `solid`."""
         return sampled_distances(self.solid)
+
+
+def _deformation_of(parameters: WeightedPlacement, placed: PlacedSolid) -> Deformation | None:
+    """Of a body whose file deforms it."""
+    if not isinstance(parameters.shape, AnimationShape):
+        return None
+    from sim.shapes.animation import AnimatedSolid
+    from sim.shapes.deformation import Deformation
+
+    assert isinstance(placed.shape, AnimatedSolid), "an animation is built as one"
+    return None if placed.shape.deformed is None else Deformation(placed.shape, parameters.shape, placed.scale)
 
 
 def _mass_properties(solid: PlacedSolid) -> MassProperties:

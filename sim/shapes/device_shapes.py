@@ -11,7 +11,10 @@ import taichi as ti
 
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
+from sim.core.host_access import put
+from sim.core.launch import kernel
 from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.deformation import Deformation
 from sim.shapes.level_set import LevelSet
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 
@@ -27,12 +30,13 @@ class Shapes(NamedTuple):
     """Shapes of bodies, (b,) each."""
 
     kind: Integers
-    size: Vectors  # of a primitive, scaled [m]
+    size: Vectors  # of a primitive, scaled [m]; of a grid that deforms 1, of others 0
     grid_values: Floats  # distances of all grids [m]
     grid_first: Integers  # place of a grid's first value
     grid_origin: Vectors  # [m]
     grid_spacing: Floats  # [m]
     grid_shape: CountTriples
+    deforms: ti.template()  # whether any grid does; its distances are followed by the x, y and z of its motion
 
 
 @ti.func
@@ -123,6 +127,70 @@ _SIZES = {
 """Kind and size of a primitive, as `primitive_distance` takes them."""
 
 
+@func
+def surface_motion(y: Vector3, b: ti.i32, shapes: Shapes) -> Vector3:
+    """How the surface near a point in the frame of body b moves there as it deforms; see `DeviceShapes.deform`."""
+    motion = Vector3(0.0)
+    if ti.static(shapes.deforms):
+        shape = shapes.grid_shape[b]
+        if shapes.kind[b] == GRID and shapes.size[b][0] > 0.0:
+            place = (y - shapes.grid_origin[b]) / shapes.grid_spacing[b]
+            nearest = ti.math.clamp(place, 0.0, ti.cast(shape - 1, ti.f32))
+            cell = ti.min(ti.cast(nearest, ti.i32), shape - 2)
+            share = nearest - ti.cast(cell, ti.f32)
+            nodes = shape[0] * shape[1] * shape[2]
+            for corner in range(8):
+                dx, dy, dz = corner // 4, corner // 2 % 2, corner % 2
+                weight = ti.select(dx == 1, share[0], 1.0 - share[0])
+                weight *= ti.select(dy == 1, share[1], 1.0 - share[1])
+                weight *= ti.select(dz == 1, share[2], 1.0 - share[2])
+                node = ((cell[0] + dx) * shape[1] + cell[1] + dy) * shape[2] + cell[2] + dz
+                for axis in ti.static(range(3)):
+                    motion[axis] += weight * shapes.grid_values[shapes.grid_first[b] + (1 + axis) * nodes + node]
+    return motion
+
+
+@kernel
+def blend(between: Floats, share: ti.f32, span: ti.f32, first: ti.i32, values: Floats):
+    """Put a grid where it is after a share of the time between two moments; its motion is its velocity times a span.
+
+    `between` has distances [m] and three components of velocities [m/s] of all nodes, of one moment, then of the other.
+    """
+    count = between.shape[0] // 2
+    for n in range(count):
+        start = between[n]
+        value = start + share * (between[count + n] - start)
+        values[first + n] = ti.select(n < count // 4, value, span * value)
+
+
+LONGEST_STEP_S = 0.05
+"""Of who asks what is near: a body's surface gets no farther beyond its sphere within it."""
+
+
+class DeformingGrid:
+    """A grid of distances among others that is to be where its body's surface is."""
+
+    def __init__(self, deformation: Deformation, first: int) -> None:
+        """Take that whose first value has a number."""
+        self._deformation, self._first = deformation, first
+        self._between = ti.ndarray(ti.f32, 8 * int(np.prod(deformation.shape)))
+        self._number = -1
+
+    def put_into(self, values: ti.Ndarray, time_s: float, span_s: float) -> None:
+        """Fill its values as of a time [s], and motions within a span [s]."""
+        fields = self._deformation.fields(time_s)
+        if fields.number != self._number:
+            moments = [
+                part
+                for distances, velocities in zip(fields.distances, fields.velocities, strict=True)
+                for part in (distances.ravel(), np.moveaxis(velocities, -1, 0).ravel())
+            ]
+            put(self._between, np.concatenate(moments))
+            self._number = fields.number
+        still = 0.0 if self._deformation.speed(time_s) == 0.0 else span_s
+        blend(self._between, fields.share, still, self._first, values)
+
+
 class DeviceShapes:
     """Primitives by their formulas and meshes by grids, one shape a body; those that share a geometry share its grid.
 
@@ -142,6 +210,7 @@ class DeviceShapes:
         size, origin, centre = np.zeros((room, 3)), np.zeros((room, 3)), np.zeros((room, 3))
         radius, step, spacing = np.zeros(room), np.zeros(room), np.ones(room)
         sampled: dict[int, tuple[int, LevelSet]] = {}
+        self._deforming: list[DeformingGrid] = []
         values = [np.zeros(1, np.float32)]
         for number, geometry in enumerate(geometries):
             solid = geometry.solid
@@ -154,10 +223,17 @@ class DeviceShapes:
                     radius[number] = size[number, 0] + np.linalg.norm(geometry.centre_of_mass)
                 continue
             if id(geometry) not in sampled:
-                level_set = geometry.fine_grid
-                sampled[id(geometry)] = sum(each.size for each in values), level_set
+                deformation, place = geometry.deformation, sum(each.size for each in values)
+                level_set = geometry.fine_grid if deformation is None else geometry.grid
+                sampled[id(geometry)] = place, level_set
                 values.append(level_set.values.ravel())
+                if deformation is not None:
+                    self._deforming.append(DeformingGrid(deformation, place))
+                    values.append(np.zeros(3 * level_set.values.size, np.float32))
             first[number], level_set = sampled[id(geometry)]
+            if geometry.deformation is not None:
+                size[number] = 1.0
+                radius[number] += LONGEST_STEP_S * geometry.deformation.largest_speed
             kind[number], shape[number], origin[number] = GRID, level_set.values.shape, level_set.origin
             spacing[number], step[number] = level_set.spacing, 0.5 * level_set.spacing
         self.centre_of_mass, self.radius, self.step = on_device(centre), on_device(radius), on_device(step)
@@ -169,4 +245,10 @@ class DeviceShapes:
             grid_origin=on_device(origin),
             grid_spacing=on_device(spacing),
             grid_shape=on_device(shape),
+            deforms=bool(self._deforming),
         )
+
+    def deform(self, time_s: float, span_s: float) -> None:
+        """Take shapes that deform as they are at a time [s]; their motion is that of a span [s] from then on."""
+        for grid in self._deforming:
+            grid.put_into(self.on_device.grid_values, time_s, span_s)

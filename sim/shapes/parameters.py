@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import KeyRefusedError, NonNegative, Parameters, Positive, Vector3
 
 PositiveVector3 = tuple[Positive, Positive, Positive]
+
+ALEMBIC, USD = "abc", ("usd", "usda", "usdc", "usdz")
+"""Endings of files of animated meshes."""
 
 
 class BoxShape(Parameters):
@@ -84,14 +87,19 @@ class BunnyShape(Parameters):
     height: Positive = Field(default=0.2, description="Height from base to the tips of the ears along z [m].")
 
 
-class MeshShape(Parameters):
+class FileShape(Parameters):
+    """A shape that is read from a file."""
+
+    file: str = Field(min_length=1, description="Path of the mesh, relative to the job file.")
+
+
+class MeshShape(FileShape):
     """A triangle mesh from a file (OBJ, PLY, STL, GLB), its bounding box centred on the origin.
 
     Holes are allowed: the inside comes from the generalized winding number (Jacobson et al. 2013).
     """
 
     type: Literal["mesh"]
-    file: str = Field(min_length=1, description="Path of the mesh, relative to the job file.")
     up: Literal["y", "z"] = Field(
         default="z", description='Which axis of the file points up; "y" rotates the mesh upright at loading.'
     )
@@ -99,6 +107,45 @@ class MeshShape(Parameters):
         default=None,
         description="Longest edge of the bounding box after loading [m]; as in the file if omitted.",
     )
+
+
+class AnimationShape(FileShape):
+    """A closed mesh that an Alembic or a USD file moves and deforms, where the file has it; its faces stay the same.
+
+    Only a kinematic body of `[[rigid]]` has such a shape. Alembic files are y-up and become z-up; USD files say so, and
+    their unit, themselves.
+    """
+
+    type: Literal["animation"]
+    file: str = Field(
+        min_length=1, description="Path of the .abc, .usd, .usda, .usdc or .usdz file, relative to the job file."
+    )
+    object: str | None = Field(
+        default=None, min_length=1, description="Name of the mesh that is meant; all meshes of the file if omitted."
+    )
+    fps: Annotated[float, Field(ge=1.0, le=1000.0)] | None = Field(
+        default=None,
+        description="Samples a second of an Alembic file, which does not say [1/s]; 24 if omitted. A USD file does.",
+    )
+    start_s: NonNegative = Field(
+        default=0.0,
+        description="When its first sample is there [s]; the body is held still before it and after the last.",
+    )
+    interpolation: Literal["cubic", "linear"] = Field(
+        default="cubic",
+        description="Between samples. cubic: velocities are continuous; linear: they are constant and jump.",
+    )
+
+    @model_validator(mode="after")
+    def _has_a_file_that_is_known(self) -> Self:
+        suffix = self.file.lower().rpartition(".")[2]
+        if suffix not in (ALEMBIC, *USD):
+            raise KeyRefusedError(
+                ("file",), f'must be an Alembic (.abc) or USD file, got "{self.file}"; a still mesh has type "mesh"'
+            )
+        if self.fps is not None and suffix != ALEMBIC:
+            raise KeyRefusedError(("fps",), "is that of the USD file, which says so itself; remove it")
+        return self
 
 
 Shape = Annotated[
@@ -111,7 +158,8 @@ Shape = Annotated[
     | RevolvedShape
     | DuckShape
     | BunnyShape
-    | MeshShape,
+    | MeshShape
+    | AnimationShape,
     Field(discriminator="type"),
 ]
 
@@ -119,12 +167,19 @@ Shape = Annotated[
 class Placement(Parameters):
     """A shape in the world: scaled, then rotated, then moved."""
 
+    may_be_animated: ClassVar[bool] = False
     shape: Shape = Field(description="What it looks like.")
     position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="World position of the shape's centre [m].")
     rotation_deg: Vector3 = Field(
         default=(0.0, 0.0, 0.0), description="Rotation about x, then y, then z (world axes) [degrees]."
     )
     scale: Positive = Field(default=1.0, description="Uniform scale factor [-].")
+
+    @model_validator(mode="after")
+    def _has_a_shape_that_it_may_have(self) -> Self:
+        if isinstance(self.shape, AnimationShape) and not self.may_be_animated:
+            raise KeyRefusedError(("shape", "type"), "is for bodies of [[rigid]] alone; take a mesh of one moment")
+        return self
 
 
 class BallastParameters(Parameters):

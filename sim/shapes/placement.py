@@ -99,7 +99,7 @@ def build_solid(placement: Placement, shapes: SharedShapes | None = None) -> Pla
     rotation = Rotation.from_euler("xyz", placement.rotation_deg, degrees=True).as_matrix()
     position = np.asarray(placement.position, dtype=np.float64)
     rest = build_rest_shape(placement.shape) if shapes is None else shapes.of(placement.shape)
-    return PlacedSolid(rest, placement.scale, rotation, position)
+    return PlacedSolid(rest, placement.scale, rotation, position + placement.scale * rotation @ rest.centre)
 
 
 def build_rest_shape(shape: Shape) -> RestShape:
@@ -132,5 +132,6 @@ _BUILDERS: Mapping[str, Callable[..., RestShape]] = {
     "duck": lambda shape: _module("procedural").build_duck(shape.length),
     "bunny": lambda shape: _module("procedural").build_bunny(shape.height),
     "mesh": lambda shape: _module("mesh_file").load_mesh_solid(shape),
+    "animation": lambda shape: _module("animation").load_animation(shape),
 }
 """How each type of shape is built: one line for a new shape."""

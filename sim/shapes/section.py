@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.shapes.parameters import MeshShape, Shape
+from sim.shapes.parameters import FileShape, Shape
 from sim.shapes.placement import build_rest_shape
 from sim.shapes.solid import ShapeError
 
@@ -33,7 +33,7 @@ def section_of(shape: Shape) -> Section:
         ShapeError: the shape cannot be built, or the plane misses it.
         OSError: its file cannot be read.
     """
-    status = Path(shape.file).stat() if isinstance(shape, MeshShape) else None
+    status = Path(shape.file).stat() if isinstance(shape, FileShape) else None
     return _section_of(shape, None if status is None else (status.st_size, status.st_mtime_ns))
 
 

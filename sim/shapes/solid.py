@@ -122,6 +122,11 @@ class RestShape(ABC):
     warnings: tuple[str, ...] = ()
 
     @property
+    def centre(self) -> NDArray[np.float64]:
+        """Where a body of the shape that is placed at the origin has the shape's own origin [m], (3,)."""
+        return np.zeros(3)
+
+    @property
     @abstractmethod
     def volume(self) -> float:
         """Volume [m³]."""

@@ -7,13 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from sim.core.domain import DomainParameters
 from sim.core.snapshots import Snapshot
 from sim.shapes.level_set import LevelSet
+from sim.shapes.mesh_solid import MeshSolid
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
+from sim.shapes.solid import TriangleMesh
 
 Float64Array = NDArray[np.float64]
 
@@ -59,13 +62,39 @@ def sample_at_rest(body: Placement, particle_radius: float) -> LevelSet:
     return LevelSet.sample(solid, max(particle_radius, longest / _FINEST_GRID))
 
 
+def deformed(before: Snapshot, now: Snapshot, particle_radius: float) -> MovingObstacle:
+    """An animated body between two frames, by its meshes in them; its distances are those of the later one."""
+    begin, end = Pose.of_snapshot(before), Pose.of_snapshot(now)
+    vertices, was = (
+        pose.at_rest(np.asarray(each.arrays["vertices"], np.float64)) for pose, each in ((end, now), (begin, before))
+    )
+    solid = MeshSolid(TriangleMesh(vertices, np.asarray(now.arrays["triangles"], np.int32)))
+    longest = float(np.max(np.ptp(vertices, axis=0)))
+    level_set = LevelSet.sample(solid, max(particle_radius, longest / _FINEST_GRID))
+    return MovingObstacle(level_set, begin, end, SurfaceMotion(cKDTree(vertices), vertices - was))
+
+
+@dataclass(frozen=True)
+class SurfaceMotion:
+    """How far points of a surface got in a body's own axes."""
+
+    tree: cKDTree  # of the points at the later frame [m]
+    moved: Float64Array  # of each since the earlier one [m], (n, 3)
+
+    def at(self, points: Float64Array) -> Float64Array:
+        """That of the nearest points [m], (k, 3)."""
+        found: Float64Array = self.moved[self.tree.query(points)[1]]
+        return found
+
+
 @dataclass(frozen=True)
 class MovingObstacle:
-    """A rigid body between two frames."""
+    """A body between two frames."""
 
     level_set: LevelSet  # signed distances at rest [m]
     begin: Pose  # pose at the earlier frame
     end: Pose  # pose at the later frame
+    surface: SurfaceMotion | None = None  # of one that deforms
 
     def pose(self, share: float) -> Pose:
         """The pose when a share of the time between the frames has passed: straight and by the shortest turn."""
@@ -152,7 +181,8 @@ class Obstacles:
         moved = rest + (depth + 0.01 * body.level_set.spacing) * normal
         position[rows] = pose.placed(moved)
         outwards = pose.rotation.apply(normal)
-        surface_velocity = (body.end.placed(rest) - body.begin.placed(rest)) / self._frame_dt
+        came_from = rest if body.surface is None else rest - body.surface.at(rest)
+        surface_velocity = (body.end.placed(rest) - body.begin.placed(came_from)) / self._frame_dt
         inflow = np.minimum(np.einsum("ij,ij->i", velocity[rows] - surface_velocity, outwards), 0.0)
         velocity[rows] -= inflow[:, None] * outwards
         return pushed

@@ -14,6 +14,7 @@ from sim.core.motion import rotation
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
 from sim.shapes.mesh_solid import MeshSolid
+from sim.shapes.parameters import AnimationShape
 from sim.shapes.placement import PlacedSolid
 from sim.shapes.solid import TriangleMesh
 from sim.smoke.parameters import SmokeParameters
@@ -34,6 +35,7 @@ def check_closed_domain(job: Job, smoke: SmokeParameters, solids: Solids, findin
         solid = solids.get(("rigid", index))
         if body.kind == "kinematic" and solid is not None:
             shares = solid.volume / room * _shares_inside(job, body, solid, box)
+            shares *= _growth(job, body, solid)
             more, less = float(shares.max() - shares[0]), float(shares[0] - shares.min())
             if max(more, less) > SQUEEZED:
                 verb, flow = ("comes into", "out") if more >= less else ("leaves", "in")
@@ -62,6 +64,25 @@ def _must_flow(where: str) -> str:
     )
 
 
+def _moments(job: Job, body: RigidBodyParameters) -> list[float]:
+    """Times of the film at which a body is looked at [s]."""
+    turns = [key.time_s for key in body.keyframe if key.time_s < job.film_s]
+    return sorted({*np.linspace(0.0, job.film_s, POSES).tolist(), *turns})
+
+
+def _growth(job: Job, body: RigidBodyParameters, solid: PlacedSolid) -> NDArray[np.float64]:
+    """Volume of a body at the same moments, over that at its start [-], (n,)."""
+    moments = np.array(_moments(job, body))
+    if not isinstance(body.shape, AnimationShape):
+        return np.ones(len(moments))
+    from sim.shapes.animation import AnimatedSolid
+
+    assert isinstance(solid.shape, AnimatedSolid), "an animation is built as one"
+    volumes = solid.shape.volumes
+    grown: NDArray[np.float64] = np.interp(moments - body.shape.start_s, solid.shape.times, volumes / volumes[0])
+    return grown
+
+
 def _shares_inside(job: Job, body: RigidBodyParameters, solid: PlacedSolid, box: Box) -> NDArray[np.float64]:
     """Share of a kinematic body's bounds that is in a box at moments of the film, from its start on [-], (n,)."""
     from scipy.spatial import ConvexHull
@@ -71,8 +92,7 @@ def _shares_inside(job: Job, body: RigidBodyParameters, solid: PlacedSolid, box:
         vertices = shape.mesh.vertices
         shape = MeshSolid(TriangleMesh(vertices[ConvexHull(vertices).vertices], shape.mesh.faces[:0]))
     path = path_of(body)
-    turns = [key.time_s for key in body.keyframe if key.time_s < job.film_s]
-    poses = [path.at(time_s) for time_s in sorted({*np.linspace(0.0, job.film_s, POSES).tolist(), *turns})]
+    poses = [path.at(time_s) for time_s in _moments(job, body)]
     rotations = rotation.matrices(np.array([pose.orientation for pose in poses]))
     at_rest = replace(solid, shape=shape, rotation=np.eye(3), position=np.zeros(3))
     reach = float(np.linalg.norm(np.abs(at_rest.bounds).max(axis=0)))

@@ -13,7 +13,7 @@ FAR_JOINT = 3.0
 
 def check_joints(job: Job, findings: Findings) -> None:
     """Note joints that the simulation would refuse."""
-    for problem in joint_problems(job.joint, job.rigid):
+    for problem in joint_problems(job.joint, job.rigid, [cloth.name for cloth in job.cloth]):
         findings.error(("joint", problem.number, *([problem.key] if problem.key else [])), problem.sentence)
 
 

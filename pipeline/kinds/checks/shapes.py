@@ -13,7 +13,7 @@ from pipeline.model.amounts import count, gigabytes
 from pipeline.model.boxes import Box
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, suggestion
-from sim.shapes.parameters import MeshShape, Placement
+from sim.shapes.parameters import FileShape, Placement
 
 OUT_OF_SCALE = 30.0
 """A mesh so many times larger than the scene is not meant: a cell of its grid of distances is a tenth of the scene."""
@@ -46,7 +46,7 @@ def build_solids(
         except ShapeError as error:
             findings.error((*path, "shape"), str(error))
             continue
-        if isinstance(placement.shape, MeshShape) and getattr(placement, "is_own_model", True):
+        if isinstance(placement.shape, FileShape) and getattr(placement, "is_own_model", True):
             triangles, meshes = triangles + len(solids[path].rest_mesh().faces), meshes + 1
             if triangles * TRIANGLE_BYTES > room_bytes:
                 findings.error(
@@ -86,7 +86,7 @@ def in_scale(solids: Solids, regions: Sequence[Box], findings: Findings) -> Soli
 
 def mesh_exists(shape: object, path: KeyPath, findings: Findings) -> bool:
     """Whether the shape of a table needs no file, or its file is there; notes what is wrong."""
-    return not isinstance(shape, MeshShape) or file_exists(shape.file, "mesh", (*path, "shape", "file"), findings)
+    return not isinstance(shape, FileShape) or file_exists(shape.file, "mesh", (*path, "shape", "file"), findings)
 
 
 def file_exists(name: str, kind: str, key: KeyPath, findings: Findings) -> bool:

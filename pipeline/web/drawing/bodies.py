@@ -185,13 +185,21 @@ def _draw_sheet(canvas: Canvas, name: str, sheet: Sheet, setting: Setting) -> No
     canvas.mesh(f"/{sheet.kind}/{name}", sheet.position, sheet.triangles, color, two_sided=True)
 
 
-def _pose_of(snapshot: Snapshot, _most: int) -> Pose:
+def _pose_of(snapshot: Snapshot, _most: int) -> Pose | Sheet:
+    """The pose of a body, or the mesh of one that a file animates."""
+    if "vertices" in snapshot.arrays:
+        vertices, triangles = snapshot.arrays["vertices"], snapshot.arrays["triangles"]
+        return Sheet(snapshot.kind, np.asarray(vertices, np.float32), np.asarray(triangles, np.int32))
     position, orientation = (np.asarray(snapshot.arrays[key], np.float64) for key in ("position", "orientation"))
     return Pose(snapshot.kind, position, orientation)
 
 
-def _draw_parts(canvas: Canvas, name: str, pose: Pose, setting: Setting) -> None:
+def _draw_parts(canvas: Canvas, name: str, pose: Pose | Sheet, setting: Setting) -> None:
     """All parts of a body whose meshes are there."""
+    if isinstance(pose, Sheet):
+        color = color_of(setting.job, name, BODY, BODY_COLOR)
+        canvas.mesh(f"/{pose.kind}/{name}/{BODY}", pose.position, pose.triangles, color)
+        return
     parameters = setting.parameters(pose, name)
     for part in () if parameters is None else parts_of(parameters.shape.type):
         mesh = setting.mesh(parameters.model, part)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.rigid import is_animated
 from pipeline.model.job import Job
 from pipeline.web.pins import JobPin, pins_of_job
 from sim.core.world import World
@@ -267,4 +268,6 @@ GRABS: Mapping[str, Callable[[Drags, str, Point, int], None]] = {
 
 def is_draggable(job: Job, kind: str, name: str) -> bool:
     """Whether a mouse may lead a thing of a scene."""
+    if kind == "rigid" and any(is_animated(body) for body in job.rigid if body.name == name):
+        return False
     return kind in GRABS and (kind != "rigid" or name in job.moving_bodies)

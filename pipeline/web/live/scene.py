@@ -7,6 +7,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from pipeline.kinds.rigid import is_animated
 from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
 from pipeline.web.drawing.bodies import Look, Mesh, Setting, body_of, draw_bodies, meshes_at_rest
@@ -55,7 +56,7 @@ class LiveScene:
         self._ball = icosphere(subdivisions=2, radius=PIN_SHARE * size)
         meshes: dict[tuple[str, str], Mesh] = {}
         for body in job.rigid:
-            meshes |= meshes_at_rest(body) if body.is_own_model else {}
+            meshes |= meshes_at_rest(body) if body.is_own_model and not is_animated(body) else {}
         look = Look(frozenset(kind.display.layer for kind in KINDS.values()))
         self._setting = Setting(job, lambda body, part: meshes[body, part], look)
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
+from pipeline.kinds.rigid import is_animated
 from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, parts_of
@@ -89,7 +90,7 @@ class JobScene:
         built: dict[tuple[str, str], Mesh] = {}
         failed: list[str] = []
         for body in self._job.rigid:
-            if not body.is_own_model:
+            if not body.is_own_model or is_animated(body):
                 continue
             files = [self._layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
             try:

@@ -77,6 +77,13 @@ def test_a_warning_says_what_it_means_for_its_kind_and_what_to_set(solver, kinds
     assert str(of_plume) == "plume: 1 solve hit its iteration limit, frame 3"
 
 
+def test_joints_that_fight_are_named(layout):
+    commit(layout, 0, joints_apart=1.0, joints_apart_rod=1.0)
+    commit(layout, 1, joints_apart=9.0, joints_apart_crank=9.0, joints_apart_rod=2.0)
+    assert "10 steps left joints apart (rod, crank), frames 0-1" in status(layout)
+    assert 'steps with "crank" apart 9' in status(layout).replace("\n    ", " ")
+
+
 def test_status_for_machines_has_all_of_it(layout):
     commit(layout, 0, not_converged=2.0)
     commit(layout, 1, kinetic_energy=4.0)

@@ -414,10 +414,18 @@ def test_loops_that_fight_are_told_and_do_not_explode():
     joints = [
         joint("wall", "ball", ("a",), anchor=(0, 0, 2)),
         joint("hand", "ball", ("a", "led"), anchor=(0.5, 0, 2)),
+        joint("key", "fixed", ("key", "led"), anchor=(0.6, 0, 2)),
     ]
+    bodies.append(body("key", cube(0.04), (0.6, 0, 2.0)))
     solver = scene(*bodies, joints=joints)
     advance(solver, 0.1, 2e-3)
     diagnostics = solver.diagnostics()
+    # Those of the loop are named, and what merely hangs on it is not.
+    assert {name for name in diagnostics if name.startswith("joints_apart_")} <= {
+        "joints_apart_wall",
+        "joints_apart_hand",
+    }
+    assert diagnostics.get("joints_apart_wall", 0.0) + diagnostics.get("joints_apart_hand", 0.0) > 10
     assert diagnostics["joints_apart"] > 10
     assert diagnostics["joint_gap"] == pytest.approx(0.01, rel=0.7)  # the two ends are 1 cm too far apart
     assert diagnostics["max_speed"] < 1.0

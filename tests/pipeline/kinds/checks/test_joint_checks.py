@@ -58,3 +58,10 @@ def test_joints_of_a_job_without_bodies_are_refused(tmp_path):
     text = 'name = "a"\nframes = 2\n' + NAIL
     errors = checked(text, tmp_path / "job.toml").errors
     assert any('names no rigid body with "arm"; add [[rigid]]' in line for line in errors)
+
+
+def test_a_joint_to_a_cloth_is_refused_by_name(tmp_path):
+    sheet = '[[cloth]]\nname = "sheet"\nshape = { type = "rectangle", size = [0.1, 0.1], counts = [3, 3] }\n'
+    sheet += "position = [0.0, 0.0, 0.9]\n"
+    errors = checked(BODIES + NAIL.replace("post", "sheet") + sheet, tmp_path / "job.toml").errors
+    assert any('names the cloth "sheet", and joints hold rigid bodies alone' in line for line in errors)
