@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
+from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import (
     NO_IMPULSES,
     NO_LINKS,
@@ -17,7 +18,7 @@ from sim.rigid.contact_solver import (
     Solution,
     solve_velocities,
 )
-from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
+from sim.rigid.contacts import Array, Contacts, Indices, rows_of
 from sim.rigid.joint_system import UNBOUNDED, JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
 from sim.rigid.restitution import Bounces, solve_impacts
@@ -56,6 +57,7 @@ class Outcome:
     iterations: int  # sweeps of the solver
     converged: bool  # whether it converged
     joint_impulses: Array  # of the joints, (r,), if there are any
+    impulses: Array  # of the contacts on their first bodies, impacts included [N s], (k, 3)
 
 
 class ContactResponse:
@@ -65,8 +67,8 @@ class ContactResponse:
         last_keys: the contacts of the last step, ascending.
     """
 
-    def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
-        self._surfaces, self._gravity = surfaces, gravity
+    def __init__(self, surfaces: Surfaces, gravity: Array, detector: CollisionDetector) -> None:
+        self._surfaces, self._gravity, self._detector = surfaces, gravity, detector
         self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
     def resolve(
@@ -91,7 +93,7 @@ class ContactResponse:
             self._replace(contacts.keys, np.zeros((0, 3)), is_active)
             nobody = np.zeros(n, dtype=bool)
             still = np.zeros(0 if step is None else len(step.values))
-            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), 0, True, still)
+            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody.copy(), 0, True, still, np.zeros((0, 3)))
         inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
         links = NO_LINKS if step is None else step.system.links()
         system = ContactSystem.build(contacts, bodies.position, inverse_mass, inverse_inertia, links)
@@ -136,6 +138,7 @@ class ContactResponse:
             impacts.iterations + solution.iterations + separation.iterations,
             impacts.converged and solution.converged and separation.converged,
             by_joints + impacts.joint_impulses + solution.joint_impulses,
+            impacts.impulses + solution.impulses,
         )
 
     def _bounce(
@@ -215,9 +218,11 @@ class ContactResponse:
 
     def _replace(self, keys: Indices, forces: Array, is_active: NDArray[np.bool_]) -> None:
         """Keep the forces of the contacts of active bodies, and those that were known of other bodies."""
-        first, second = bodies_of(self.last_keys)
-        among = np.append(is_active, False)
-        stays = ~(among[np.minimum(first, len(is_active))] | among[np.minimum(second, len(is_active))])
+        movers, among = self._detector.movers, np.append(is_active, False)
+        first, second = (
+            np.minimum(movers[bodies], len(is_active)) for bodies in self._detector.bodies_of(self.last_keys)
+        )
+        stays = ~(among[first] | among[second])
         self._keep(np.concatenate([keys, self.last_keys[stays]]), np.concatenate([forces, self._forces[stays]]))
 
     def _keep(self, keys: Indices, forces: Array) -> None:
