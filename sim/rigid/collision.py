@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +17,7 @@ from sim.core.solver import Arrays
 from sim.core.walls import Wall
 from sim.rigid.broad_phase import NearBoxes
 from sim.rigid.collision_shapes import CollisionShapes
-from sim.rigid.contacts import BODY_BITS, AnchoredContacts, Array, Contacts, Indices, bodies_of, pair_keys, rows_of
+from sim.rigid.contacts import BODY_BITS, AnchoredContacts, Array, Contacts, Indices, pair_keys, rows_of
 from sim.shapes.body_geometry import BodyGeometry
 
 CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
@@ -26,41 +25,16 @@ TRUSTED_MOTION = 1.0e-3  # contacts are looked for anew after surfaces moved so 
 BLOCKS = 512  # of pairs that a GPU looks at side by side
 
 
-@dataclass(frozen=True, eq=False)
-class _Boxes:
-    """Boxes around bodies or parts, in their frames [m], (n, 3) each."""
-
-    centre: Array
-    half_edges: Array
-
-    @classmethod
-    def of(cls, geometries: Sequence[BodyGeometry]) -> _Boxes:
-        """Those of some."""
-        bounds = np.stack([geometry.bounds for geometry in geometries])
-        return cls(bounds.mean(axis=1), 0.5 * np.ptp(bounds, axis=1))
-
-    def at(self, poses: Poses) -> tuple[Array, Array]:
-        """Lower and upper corners of the axis-aligned boxes around all in poses, of which the last is the domain's."""
-        turned = poses.rotation[:-1]
-        centre = poses.position[:-1] + np.einsum("nij,nj->ni", turned, self.centre)
-        half = np.einsum("nij,nj->ni", np.abs(turned), self.half_edges)
-        return centre - half, centre + half
-
-
 class CollisionDetector:
     """Finds the contacts of bodies with each other and with walls.
 
-    Bodies are numbered: moving ones, static ones, and last the domain, which stands still at the origin. What touches
-    is their parts, numbered likewise: most bodies are one. Keys of contacts are those of parts. A pair is examined
-    again when its surfaces may have moved by more than `TRUSTED_MOTION`; until then its contacts are followed
+    Bodies are numbered: moving ones, static ones, and last the domain, which stands still at the origin. A pair is
+    examined again when its surfaces may have moved by more than `TRUSTED_MOTION`; until then its contacts are followed
     (`AnchoredContacts`), all within that distance included.
 
     Attributes:
         followed: the contacts that are being followed, by pair.
         untouching: keys of pairs of bodies that do not touch each other, as joints hold them, ascending.
-        body: number of the body of each part, and of the domain, (parts + 1,).
-        movers: number of the body that each body moves with, its own unless it is glued to others, (n + 1,). Contacts
-            are told of movers, and there are none between bodies of one.
 
     Raises:
         ValueError: there are too many bodies for the keys of contacts.
@@ -68,19 +42,13 @@ class CollisionDetector:
 
     def __init__(self, geometries: Sequence[BodyGeometry], walls: Sequence[Wall]) -> None:
         """Take all bodies but the domain."""
-        self._walls, self._boxes_of_bodies = tuple(walls), _Boxes.of(geometries)
-        parts = [part for geometry in geometries for part in geometry.contact_parts]
-        of_body = [number for number, geometry in enumerate(geometries) for _ in geometry.contact_parts]
-        self.body, self.movers = np.array([*of_body, len(geometries)]), np.arange(len(geometries) + 1)
-        self._place = np.array([*(part.position for part in parts), np.zeros(3)])
-        self._turn = np.array([*(part.rotation for part in parts), np.eye(3)])
-        self._is_plain = all(geometry.contact_parts[0].geometry is geometry for geometry in geometries)
-        self._geometries = tuple(part.geometry for part in parts)
-        self._boxes_of_parts = _Boxes.of(self._geometries)
-        self._domain = len(parts)
+        self._geometries, self._walls = tuple(geometries), tuple(walls)
+        self._domain = len(geometries)
         if self._domain >= 1 << BODY_BITS:
             raise ValueError(f"there are {self._domain:,} rigid bodies; at most {(1 << BODY_BITS) - 1:,} can meet")
-        self._size = np.array([*(geometry.shortest_edge for geometry in self._geometries), np.inf])
+        self._centre = np.stack([geometry.bounds.mean(axis=0) for geometry in geometries])
+        self._half_edges = np.stack([0.5 * np.ptp(geometry.bounds, axis=0) for geometry in geometries])
+        self._size = np.array([*(geometry.shortest_edge for geometry in geometries), np.inf])
         self._pairs, self._budget = np.zeros(0, dtype=np.int64), np.zeros(0)
         self.followed = AnchoredContacts.joined([])
         self._boxes = NearBoxes()
@@ -88,23 +56,10 @@ class CollisionDetector:
 
     def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
         """Those of some pairs of bodies, the lower number first, that may touch, (p,) each."""
-        may = self._may_touch(first, second)
+        if not len(self.untouching):
+            return first, second
+        may = ~rows_of(pair_keys(first, second), self.untouching)[1]
         return first[may], second[may]
-
-    def _may_touch(self, first: Indices, second: Indices) -> NDArray[np.bool_]:
-        """Whether pairs of bodies may touch, (p,)."""
-        may: NDArray[np.bool_] = self.movers[first] != self.movers[second]
-        if len(self.untouching):
-            may &= ~rows_of(pair_keys(first, second), self.untouching)[1]
-        return may
-
-    def _of_parts(self, poses: Poses) -> Poses:
-        """Poses of all parts."""
-        if self._is_plain:
-            return poses
-        turned = poses.rotation[self.body]
-        arms = np.einsum("nij,nj->ni", turned, self._place)
-        return Poses(poses.position[self.body] + arms, turned @ self._turn)
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The contacts that are being followed: bodies that rest on others than before would tremble."""
@@ -137,8 +92,7 @@ class CollisionDetector:
         The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the last step,
         by their ascending keys, are preferred among equals. Contacts of bodies that are not active are kept.
         """
-        poses, motion, is_active = self._of_parts(poses), motion[self.body], is_active[self.body[:-1]]
-        lower, upper = self._boxes_of_parts.at(poses)
+        lower, upper = self.boxes(poses)
         first, second, wall = self._near(lower, upper, poses, motion, is_active)
         pairs, of_task = np.unique(pair_keys(first, second), return_inverse=True)
         ahead = motion[pairs >> BODY_BITS] + motion[pairs & ((1 << BODY_BITS) - 1)]
@@ -165,17 +119,10 @@ class CollisionDetector:
         order = np.argsort(np.concatenate([pairs, self._pairs[asleep]]))
         self._budget = np.concatenate([budget, self._budget[asleep]])[order]
         self._pairs = np.concatenate([pairs, self._pairs[asleep]])[order]
-        found = self.followed
-        if asleep.any():
-            owned = pair_keys(found.first, found.second)
-            found = found.chosen(np.flatnonzero(self._is_of(owned, is_active)))
-        contacts, mover = found.at(poses), self.movers[self.body]
-        return replace(contacts, first=mover[contacts.first], second=mover[contacts.second])
-
-    def bodies_of(self, keys: Indices) -> tuple[Indices, Indices]:
-        """The two bodies of contacts by their keys, whatever they move with, (k,) each; the domain is one."""
-        first, second = bodies_of(keys)
-        return self.body[first], self.body[second]
+        if not asleep.any():
+            return self.followed.at(poses)
+        owned = pair_keys(self.followed.first, self.followed.second)
+        return self.followed.chosen(np.flatnonzero(self._is_of(owned, is_active))).at(poses)
 
     def follow(self, motion: Array) -> None:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
@@ -184,11 +131,14 @@ class CollisionDetector:
 
     def near(self) -> tuple[Indices, Indices]:
         """The pairs of bodies that were near in the last step, (p,) each; the domain is one."""
-        return self.body[self._pairs >> BODY_BITS], self.body[self._pairs & ((1 << BODY_BITS) - 1)]
+        return self._pairs >> BODY_BITS, self._pairs & ((1 << BODY_BITS) - 1)
 
     def boxes(self, poses: Poses) -> tuple[Array, Array]:
         """Lower and upper corners of all bodies' axis-aligned boxes [m], (n, 3) each."""
-        return self._boxes_of_bodies.at(poses)
+        turned = poses.rotation[:-1]
+        centre = poses.position[:-1] + np.einsum("nij,nj->ni", turned, self._centre)
+        half = np.einsum("nij,nj->ni", np.abs(turned), self._half_edges)
+        return centre - half, centre + half
 
     @cached_property
     def _shapes(self) -> CollisionShapes:
@@ -234,9 +184,8 @@ class CollisionDetector:
     ) -> tuple[Indices, Indices, Indices]:
         """Pairs whose boxes are within their margins, and the wall that is meant, or -1: (k,) each, by pair."""
         reach = ((CONTACT_BAND + TRUSTED_MOTION) * self._size[:-1] + motion[:-1])[:, None]
-        first, second = self._boxes.overlapping(lower - reach, upper + reach, motion[:-1], is_active)
-        may = self._may_touch(self.body[first], self.body[second])
-        first, second = first[may], second[may]
+        boxes = self._boxes.overlapping(lower - reach, upper + reach, motion[:-1], is_active)
+        first, second = self.touching(*boxes)
         apart = np.maximum(lower[first] - upper[second], lower[second] - upper[first]).max(axis=1)
         near = apart <= self._margin(first, second, motion)
         pairs = [(first[near], second[near], np.full(np.count_nonzero(near), -1))]

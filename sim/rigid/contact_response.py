@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
-from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import (
     NO_IMPULSES,
     NO_LINKS,
@@ -18,7 +18,7 @@ from sim.rigid.contact_solver import (
     Solution,
     solve_velocities,
 )
-from sim.rigid.contacts import Array, Contacts, Indices, rows_of
+from sim.rigid.contacts import Array, Contacts, Indices, bodies_of, rows_of
 from sim.rigid.joint_system import UNBOUNDED, JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
 from sim.rigid.restitution import Bounces, solve_impacts
@@ -28,6 +28,8 @@ SEPARATION_TIME_S, LARGEST_SEPARATION = 0.02, 0.2  # in which overlaps decay, an
 SLOP = 1.0e-6  # overlap that stays [m]: below what anybody sees, above what rounding makes
 MOST_ROUNDS = 50  # of impacts in a step; after them what still approaches no longer bounces
 WEIGHT_TOLERANCE = 1.0e-4  # of the speed that gravity gives in a step: what the last sweep may still change
+
+BodiesOf = Callable[[Indices], tuple[Indices, Indices]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +69,9 @@ class ContactResponse:
         last_keys: the contacts of the last step, ascending.
     """
 
-    def __init__(self, surfaces: Surfaces, gravity: Array, detector: CollisionDetector) -> None:
-        self._surfaces, self._gravity, self._detector = surfaces, gravity, detector
+    def __init__(self, surfaces: Surfaces, gravity: Array, movers_of: BodiesOf = bodies_of) -> None:
+        """Take also what tells of which bodies contacts are, by their keys."""
+        self._surfaces, self._gravity, self._movers_of = surfaces, gravity, movers_of
         self._keep(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
     def resolve(
@@ -218,11 +221,9 @@ class ContactResponse:
 
     def _replace(self, keys: Indices, forces: Array, is_active: NDArray[np.bool_]) -> None:
         """Keep the forces of the contacts of active bodies, and those that were known of other bodies."""
-        movers, among = self._detector.movers, np.append(is_active, False)
-        first, second = (
-            np.minimum(movers[bodies], len(is_active)) for bodies in self._detector.bodies_of(self.last_keys)
-        )
-        stays = ~(among[first] | among[second])
+        first, second = self._movers_of(self.last_keys)
+        among = np.append(is_active, False)
+        stays = ~(among[np.minimum(first, len(is_active))] | among[np.minimum(second, len(is_active))])
         self._keep(np.concatenate([keys, self.last_keys[stays]]), np.concatenate([forces, self._forces[stays]]))
 
     def _keep(self, keys: Indices, forces: Array) -> None:

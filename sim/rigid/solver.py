@@ -16,13 +16,13 @@ from sim.core.parameters import Vector3
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
-from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
-from sim.rigid.contacts import Indices
+from sim.rigid.contacts import Indices, bodies_of
 from sim.rigid.glue import MOST_ROUNDS, Glue
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.parts import PartsDetector, detector_of
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies, rotate_freely
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
@@ -105,12 +105,13 @@ class RigidSolver:
         self.all_names = tuple(body.name for body in everybody)
         self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
-        self._detector = CollisionDetector(self.all_geometries, self.walls)
+        self._detector = detector_of(self.all_geometries, self.walls)
         self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
         )
-        self._response = ContactResponse(self.surfaces, self.gravity, self._detector)
+        movers_of = self._detector.movers_of if isinstance(self._detector, PartsDetector) else bodies_of
+        self._response = ContactResponse(self.surfaces, self.gravity, movers_of)
         corners = np.array([domain.min, domain.max])
         self._chooser = StepChooser(self.all_geometries, self.bodies, self.walls, self._detector, self.gravity)
         self.joints = Joints(joints, everybody, self.bodies) if joints else None
@@ -215,8 +216,8 @@ class RigidSolver:
         inverse_inertia, joints = bodies.inverse_inertia(), self.joints
         step = None if joints is None else joints.begin(bodies, dt, is_active, inverse_inertia)
         outcome = self._response.resolve(contacts, bodies, dt, is_active, inverse_inertia, joints, step)
-        if glue is not None:
-            pieces = self._detector.bodies_of(contacts.keys)
+        if glue is not None and isinstance(self._detector, PartsDetector):
+            pieces = self._detector.pieces
             broken = glue.overloaded(contacts, pieces, outcome.impulses, unstopped, dt, everybody)
             if len(broken) and rounds > 0:
                 bodies.velocity, bodies.angular_velocity = velocities
@@ -283,8 +284,9 @@ class RigidSolver:
         if self.joints is not None:
             self._detector.untouching = self.joints.untouching()
             links.append(self.joints.links())
-        if self.glue is not None:
-            self._detector.movers[: len(self.bodies)] = self.glue.leader
+        if self.glue is not None and isinstance(self._detector, PartsDetector):
+            stands = np.arange(len(self.bodies), len(self.all_names))
+            self._detector.glue(np.concatenate([self.glue.leader, stands]))
             links.append(self.glue.links())
         if links:
             first, second = (np.concatenate(each) for each in zip(*links, strict=True))

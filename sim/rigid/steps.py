@@ -15,6 +15,7 @@ from sim.core.walls import Wall
 from sim.rigid.broad_phase import NearBoxes
 from sim.rigid.collision import CONTACT_BAND, TRUSTED_MOTION, CollisionDetector
 from sim.rigid.contacts import Array, Indices
+from sim.rigid.parts import PartsDetector
 from sim.rigid.states import MovingBodies
 from sim.shapes.body_geometry import BodyGeometry
 
@@ -49,7 +50,7 @@ class StepChooser:
         geometries: Sequence[BodyGeometry],
         bodies: MovingBodies,
         walls: Sequence[Wall],
-        detector: CollisionDetector,
+        detector: CollisionDetector | PartsDetector,
         gravity: Array,
     ) -> None:
         """Take the moving bodies, which come first among the geometries."""

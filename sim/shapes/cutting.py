@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Voronoi
 
 from sim.shapes.assembly import BODY_PART, Assembly, manifold_of, mesh_of
-from sim.shapes.mesh_solid import MeshSolid
+from sim.shapes.mesh_solid import ConvexSolid
 from sim.shapes.parameters import CompoundShape, MeshShape, PieceShape, Shape
 from sim.shapes.placement import PlacedSolid, build_rest_shape
 from sim.shapes.solid import RestShape, ShapeError, TriangleMesh
@@ -25,6 +25,8 @@ CANDIDATES = 10  # points of which the farthest from all others is taken
 MOST_DRAWS = 200_000  # of points, until one is inside of a shape
 SAME_PLANE = 1.0e-6  # by how much planes of two faces that touch may differ, in sizes of the body
 LEAST_AREA = 1.0e-9  # of a face between two pieces, in squared sizes of the body
+
+MOST_CORNERS = 120  # of the hull of a piece
 
 Array = NDArray[np.float64]
 
@@ -116,14 +118,21 @@ def _voronoi_cut(whole: RestShape, count: int, seed: int) -> Cut:
 
 
 def hull_of(points: Array) -> PlacedSolid:
-    """The convex hull of some points."""
+    """The convex hull of some points; of round ones that of those that are farthest in some directions."""
     hull = ConvexHull(points)
+    if len(hull.vertices) > MOST_CORNERS:
+        # Evenly over a sphere (Gonzalez 2010, "Measurement of areas on a sphere using Fibonacci lattices").
+        height = (2.0 * np.arange(MOST_CORNERS) + 1.0) / MOST_CORNERS - 1.0
+        angle, across = np.arange(MOST_CORNERS) * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(1.0 - height * height)
+        ways = np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1)
+        points = points[np.unique(np.argmax(points @ ways.T, axis=0))]
+        hull = ConvexHull(points)
     used, faces = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], faces.reshape(hull.simplices.shape).astype(np.int32)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     turned = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
     faces[turned] = faces[turned][:, ::-1]
-    return PlacedSolid(MeshSolid(TriangleMesh(vertices, faces)), 1.0, np.eye(3), np.zeros(3))
+    return PlacedSolid(ConvexSolid(TriangleMesh(vertices, faces)), 1.0, np.eye(3), np.zeros(3))
 
 
 def _points_inside(whole: RestShape, bounds: Array, count: int, seed: int) -> Array:
@@ -171,7 +180,7 @@ def _touching(meshes: Sequence[TriangleMesh], size: float) -> Iterator[TouchingF
             origin = one.triangles[row][0, 0]
             sections = [
                 manifold3d.CrossSection(
-                    list((triangles - origin) @ axes.T)[:: 1], manifold3d.FillRule.NonZero
+                    list((triangles - origin) @ axes.T), manifold3d.FillRule.NonZero
                 )
                 for triangles in (one.triangles[row], two.triangles[other])
             ]
