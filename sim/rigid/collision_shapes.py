@@ -53,7 +53,9 @@ class CollisionShapes:
         found = [polytope_of(geometry) for geometry in shapes]
         if not any(isinstance(geometry.solid.shape, ConvexSolid) for geometry in shapes):
             # Spheres are as exact by their balls.
-            found = [None if isinstance(each.solid.shape, Sphere) else own for each, own in zip(shapes, found, strict=True)]
+            found = [
+                None if isinstance(each.solid.shape, Sphere) else own for each, own in zip(shapes, found, strict=True)
+            ]
         # Between polytopes nobody asks for balls and distances.
         is_asked = any(each is None for each in found)
         balls, clusters = [np.zeros((1, 8))], [np.zeros((1, 4))]

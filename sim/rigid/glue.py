@@ -84,7 +84,8 @@ class Glue:
         self.leader, self._arm = np.arange(n), np.zeros((n, 3))
         self._known: dict[int, _Component] = {}
         self._rest, self._blow = np.zeros((n, 6)), np.zeros((n, 6))  # force [N] and last blow [N s] on each piece
-        self._next: tuple[Array, Array, Array] | None = None
+        self._was_hit = np.zeros(n, dtype=bool)  # whether a blow began in the last step
+        self._next: tuple[Array, Array, Array, NDArray[np.bool_]] | None = None
         self._pushes = np.zeros((n, 6))  # impulses of what is no contact since the last step [N s]
         self.movers = MovingBodies(
             bodies.names,
@@ -220,13 +221,19 @@ class Glue:
             arms = contacts.point[rows] - self._bodies.position[own[rows]]
             wrench = sign * np.concatenate([impulses[rows], rotation.cross(arms, impulses[rows])], axis=1)
             np.add.at(load, own[rows], wrench)
-        is_struck = self._struck(contacts, impulses, velocity)[self.leader]
+        is_hit = self._struck(contacts, impulses, velocity)[self.leader]
         # A blow is what is more than the force of before; it may be in two steps, as gaps close in the first.
+        is_struck = is_hit | self._was_hit
         blow = np.where(is_struck[:, None], load - dt * self._rest, 0.0)
         force = np.where(is_struck[:, None], self._rest + (blow + self._blow) / self._impact_s[:, None], load / dt)
         active = is_active & self._is_piece
         rest = np.where((active & ~is_struck)[:, None], load / dt, self._rest)
-        self._next = rest, np.where(active[:, None], blow, self._blow), np.where(active[:, None], 0.0, self._pushes)
+        self._next = (
+            rest,
+            np.where(active[:, None], blow, self._blow),
+            np.where(active[:, None], 0.0, self._pushes),
+            np.where(active, is_hit, self._was_hit),
+        )
         broken = [np.zeros(0, dtype=np.int64)]
         for leader in np.unique(self.leader[active & self.is_glued]):
             broken.append(self._overloaded_of(int(leader), force))
@@ -235,7 +242,7 @@ class Glue:
     def settle(self) -> None:
         """Keep the loads of the step just taken."""
         assert self._next is not None, "loads are looked at before a step ends"
-        self._rest, self._blow, self._pushes = self._next
+        self._rest, self._blow, self._pushes, self._was_hit = self._next
 
     def _struck(self, contacts: Contacts, impulses: Array, velocity: tuple[Array, Array]) -> NDArray[np.bool_]:
         """Movers that a blow goes through, (n,), wherever it came from."""
@@ -347,19 +354,22 @@ class Glue:
         """What is broken, how what holds together moves, and the loads of the last step."""
         return {
             "glue_broken": self.is_broken.copy(),
-            "glue_loads": np.stack([self._rest, self._blow]),
+            "glue_hit": self._was_hit.copy(),
+            "glue_loads": np.stack([self._rest, self._blow, self._pushes]),
             **{f"glue_{name}": getattr(self.movers, name).copy() for name in _STATE},
         }
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint. Raises ValueError when an array is missing or has another shape."""
-        expected = {"glue_broken": self.is_broken.shape, "glue_loads": (2, *self._rest.shape)}
+        expected = {"glue_broken": self.is_broken.shape, "glue_hit": self._was_hit.shape}
+        expected |= {"glue_loads": (3, *self._rest.shape)}
         expected |= {f"glue_{name}": getattr(self.movers, name).shape for name in _STATE}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}")
         self.is_broken = np.array(arrays["glue_broken"], dtype=bool)
-        self._rest, self._blow = np.array(arrays["glue_loads"], dtype=np.float64)
+        self._was_hit = np.array(arrays["glue_hit"], dtype=bool)
+        self._rest, self._blow, self._pushes = np.array(arrays["glue_loads"], dtype=np.float64)
         self.weigh()
         for name in _STATE:
             setattr(self.movers, name, np.array(arrays[f"glue_{name}"], dtype=getattr(self.movers, name).dtype))

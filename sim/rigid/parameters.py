@@ -166,9 +166,7 @@ class RigidBodyParameters(WeightedPlacement):
         pieces, seed = self.breaks.pieces, self.breaks.seed
         for number in range(1, 1 + (pieces or len(getattr(self.shape, "part", ())))):
             shape = PieceShape(type="piece", of=self.shape, pieces=pieces, seed=seed, number=number)
-            piece = self.placed(
-                self.table, model=f"{self.model}_{number}", name=f"{self.name}_{number}", shape=shape
-            )
+            piece = self.placed(self.table, model=f"{self.model}_{number}", name=f"{self.name}_{number}", shape=shape)
             piece._whole = self.name
             yield piece
 
@@ -193,7 +191,7 @@ class RigidBodyParameters(WeightedPlacement):
             if self.kind != "dynamic":
                 raise KeyRefusedError(("breaks",), f'has no meaning for a {self.kind} body; use kind = "dynamic"')
             if self.ballast:
-                raise KeyRefusedError(("ballast",), "is in no piece of a body that breaks; make it a part of a compound")
+                raise KeyRefusedError(("ballast",), "is in no piece of a body that breaks; make it a part of one")
             if self.breaks.pieces is None and (self.shape.type != "compound" or len(self.shape.part) < 2):
                 raise KeyRefusedError(
                     ("breaks", "pieces"), "is missing; only a compound of two parts or more has pieces without it"

@@ -39,13 +39,8 @@ def polytope_of(geometry: BodyGeometry) -> Polytope | None:
     if isinstance(shape, Sphere):
         none = np.zeros(0, dtype=np.int64)
         return Polytope(geometry.solid.scale * shape.radius, np.zeros((1, 3)), np.zeros((0, 4)), none, none)
-    if not isinstance(shape, Box | MeshSolid):
-        return None
-    try:
-        hull = ConvexHull(geometry.solid.rest_mesh().vertices - geometry.centre_of_mass)
-    except QhullError:
-        return None
-    if isinstance(shape, MeshSolid) and not isinstance(shape, ConvexSolid) and hull.volume - geometry.solid.volume > CONVEX * hull.volume:
+    hull = _convex_hull(geometry) if isinstance(shape, Box | MeshSolid) else None
+    if hull is None:
         return None
     size, radius = float(np.ptp(hull.points, axis=0).max()), BALL_DEPTH * geometry.shortest_edge
     planes = _distinct(hull.equations * [1.0, 1.0, 1.0, 1.0 / size]) * [1.0, 1.0, 1.0, size]
@@ -65,6 +60,16 @@ def polytope_of(geometry: BodyGeometry) -> Polytope | None:
     return Polytope(
         radius, vertices, planes[kept] * [1.0, 1.0, 1.0, -1.0], np.concatenate([loops[k] for k in kept]), counts
     )
+
+
+def _convex_hull(geometry: BodyGeometry) -> ConvexHull | None:
+    """The hull of a body that is convex, in its frame."""
+    try:
+        hull = ConvexHull(geometry.solid.rest_mesh().vertices - geometry.centre_of_mass)
+    except QhullError:
+        return None
+    is_known = isinstance(geometry.solid.shape, Box | ConvexSolid)
+    return hull if is_known or hull.volume - geometry.solid.volume <= CONVEX * hull.volume else None
 
 
 def _distinct(rows: Array) -> Array:

@@ -54,9 +54,7 @@ def build_compound(shape: CompoundShape) -> Assembly:
 
     placed = tuple(build_solid(part) for part in shape.part)
     names = (BODY_PART, *dict.fromkeys(part.name for part in shape.part if part.name is not None))
-    manifolds = [
-        manifold_of(solid.surface_mesh(), f"shape.part[{number}]") for number, solid in enumerate(placed)
-    ]
+    manifolds = [manifold_of(solid.surface_mesh(), f"shape.part[{number}]") for number, solid in enumerate(placed)]
     part_of = {
         manifold.original_id(): names.index(part.name or BODY_PART)
         for manifold, part in zip(manifolds, shape.part, strict=True)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +64,8 @@ def cut_of(shape: PieceShape) -> Cut:
 
 def _states_of_files(shape: Shape) -> Iterator[tuple[int, int]]:
     """Sizes and times of the files of a shape, which may change while a program runs."""
-    if isinstance(shape, MeshShape) and os.path.exists(shape.file):
-        status = os.stat(shape.file)
+    if isinstance(shape, MeshShape) and Path(shape.file).is_file():
+        status = Path(shape.file).stat()
         yield status.st_size, status.st_mtime_ns
     for part in shape.part if isinstance(shape, CompoundShape) else ():
         yield from _states_of_files(part.shape)
@@ -109,9 +109,10 @@ def _voronoi_cut(whole: RestShape, count: int, seed: int) -> Cut:
         parts = {solid.original_id(): 0, cell.original_id(): 1}
         surface = mesh_of(found, parts, (BODY_PART, INSIDE_PART))
         alone = len(found.decompose())
-        warnings = () if alone == 1 else (
-            f"piece {number + 1} of {count} is in {alone} parts, which move as one; give more pieces, or another seed",
-        )
+        warnings: tuple[str, ...] = ()
+        if alone > 1:
+            remedy = "which move as one; give more pieces, or another seed"
+            warnings = (f"piece {number + 1} of {count} is in {alone} parts, {remedy}",)
         pieces.append(Assembly(surface, warnings=warnings, solids=(hull_of(surface.vertices),)))
         meshes.append(surface)
     return Cut(tuple(pieces), tuple(_touching(meshes, size)))
@@ -169,7 +170,9 @@ def _touching(meshes: Sequence[TriangleMesh], size: float) -> Iterator[TouchingF
     planes = [_inner_planes(mesh, size) for mesh in meshes]
     low, high = (np.array([getattr(mesh.vertices, edge)(axis=0) for mesh in meshes]) for edge in ("min", "max"))
     for first, second in combinations(range(len(meshes)), 2):
-        if np.any(low[first] > high[second] + SAME_PLANE * size) or np.any(low[second] > high[first] + SAME_PLANE * size):
+        if np.any(low[first] > high[second] + SAME_PLANE * size) or np.any(
+            low[second] > high[first] + SAME_PLANE * size
+        ):
             continue
         one, two = planes[first], planes[second]
         same = np.abs(one.rows[:, None] + two.rows).max(axis=2) <= SAME_PLANE
@@ -179,9 +182,7 @@ def _touching(meshes: Sequence[TriangleMesh], size: float) -> Iterator[TouchingF
             axes = np.stack([along / np.linalg.norm(along), np.cross(normal, along) / np.linalg.norm(along)])
             origin = one.triangles[row][0, 0]
             sections = [
-                manifold3d.CrossSection(
-                    list((triangles - origin) @ axes.T), manifold3d.FillRule.NonZero
-                )
+                manifold3d.CrossSection(list((triangles - origin) @ axes.T), manifold3d.FillRule.NonZero)
                 for triangles in (one.triangles[row], two.triangles[other])
             ]
             common = sections[0] ^ sections[1]
@@ -212,7 +213,7 @@ def _inner_planes(mesh: TriangleMesh, size: float) -> _Planes:
     of_plane: list[list[int]] = []
     for number in np.argsort(-area[real], kind="stable"):
         differ = np.abs(np.array(kept).reshape(-1, 4) - rows[number]).max(axis=1)
-        if len(kept) and differ.min() <= SAME_PLANE * 10.0:
+        if kept and differ.min() <= SAME_PLANE * 10.0:
             of_plane[int(np.argmin(differ))].append(int(number))
         else:
             kept.append(rows[number])
