@@ -16,6 +16,7 @@ from sim.core.parameters import Vector3
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
+from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
 from sim.rigid.contacts import Indices, bodies_of
 from sim.rigid.glue import MOST_ROUNDS, Glue
@@ -105,7 +106,8 @@ class RigidSolver:
         self.all_names = tuple(body.name for body in everybody)
         self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
-        self._detector = detector_of(self.all_geometries, self.walls)
+        make = detector_of if self.bodies.is_dynamic.any() else CollisionDetector
+        self._detector = make(self.all_geometries, self.walls)
         self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from sim.shapes.assembly import Assembly
 from sim.shapes.balls import Balls, exact_balls, surface_balls
+from sim.shapes.convex_pieces import convex_pieces
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, mass_properties_of_solid
-from sim.shapes.mesh_solid import MeshSolid
+from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
 from sim.shapes.parameters import BallastParameters, WeightedPlacement
 from sim.shapes.placement import PlacedSolid, build_solid
 from sim.shapes.solid import Points
@@ -63,12 +64,17 @@ class BodyGeometry:
 
     @cached_property
     def contact_parts(self) -> tuple[ContactPart, ...]:
-        """The solids that stand for the body in contacts: itself, or those of an assembly."""
+        """The solids that stand for the body in contacts: itself, those of an assembly, or convex pieces of a mesh."""
         shape, scale = self.solid.shape, self.solid.scale
-        if not isinstance(shape, Assembly):
+        solids: tuple[PlacedSolid, ...] = ()
+        if isinstance(shape, Assembly):
+            solids = shape.solids
+        elif isinstance(shape, MeshSolid) and not isinstance(shape, ConvexSolid):
+            solids = convex_pieces(shape)
+        if not solids:
             return (ContactPart(self, np.zeros(3), np.eye(3)),)
         found = []
-        for solid in shape.solids:
+        for solid in solids:
             geometry = BodyGeometry.of(PlacedSolid(solid.shape, scale * solid.scale, np.eye(3), np.zeros(3)))
             position = scale * solid.position + solid.rotation @ geometry.centre_of_mass - self.centre_of_mass
             for part in geometry.contact_parts:
