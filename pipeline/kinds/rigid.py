@@ -33,11 +33,12 @@ if TYPE_CHECKING:
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
     from pipeline.kinds.checks.joints import check_anchors
-    from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
+    from pipeline.kinds.checks.rigid import check_ballast, check_pieces, check_places, check_rigid_start
 
     check_places(job, solids, findings)
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
+    check_pieces(job, solids, findings)
     check_anchors(job, solids, findings)
     return 0
 

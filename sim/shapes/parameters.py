@@ -112,9 +112,7 @@ class CompoundShape(Parameters):
 
     type: Literal["compound"]
     part: Annotated[tuple[PartParameters, ...], Field(min_length=1, max_length=MOST_PIECES)] = Field(
-        description="Its parts, a list of tables: `shape`, and `position` [m], `rotation_deg` [degrees] and `scale` in "
-        "the body's axes; `density` [kg/m³] if it is not the body's; `name`, but not of the first, for a material of "
-        'its own: [material."hammer.handle"].'
+        description="Its parts."
     )
 
     @model_validator(mode="after")
@@ -170,11 +168,17 @@ class Placement(Parameters):
 class PartParameters(Placement):
     """A part of a compound: a shape, where it is in the body, and what it is made of."""
 
+    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Of the shape's centre, in the body's axes [m].")
+    rotation_deg: Vector3 = Field(
+        default=(0.0, 0.0, 0.0), description="Rotation about the body's x, then y, then z axis [degrees]."
+    )
     density: Annotated[float, Field(ge=1e-3, le=1e6)] | None = Field(
         default=None, description="Mass per volume [kg/m³]; the body's if omitted."
     )
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")] | None = Field(
-        default=None, description="Name of the part, by which it has a material of its own."
+        default=None,
+        description='Name of the part, by which it has a material of its own, as [material."hammer.handle"]; '
+        "the first is the body itself.",
     )
 
 
