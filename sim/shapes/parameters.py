@@ -134,7 +134,7 @@ class PieceShape(Parameters):
         default=None, description="How many there are [-]; the parts of a compound if omitted."
     )
     seed: Annotated[int, Field(ge=0)] = Field(default=0, description="Of the random points that they lie around.")
-    number: Annotated[int, Field(ge=1, le=MOST_PIECES)] = Field(description="Which of them this is, from 1.")
+    number: Annotated[int, Field(ge=1, le=MOST_PIECES)] = Field(description="Which of them this is, from 1 [-].")
 
 
 Shape = Annotated[
