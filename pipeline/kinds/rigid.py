@@ -19,7 +19,7 @@ from pipeline.kinds.live_parameters import RIGID_LIVE
 from pipeline.kinds.sizes import boxes_of_body, size_of_solid
 from pipeline.kinds.work import rigid_work
 from pipeline.model.job import Job
-from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
+from pipeline.model.looks import BODY, natural_materials, parts_of
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_points
 from render.meshes import read_ply
@@ -33,18 +33,19 @@ if TYPE_CHECKING:
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
     from pipeline.kinds.checks.joints import check_anchors
-    from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
+    from pipeline.kinds.checks.rigid import check_ballast, check_pieces, check_places, check_rigid_start
 
     check_places(job, solids, findings)
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
+    check_pieces(job, solids, findings)
     check_anchors(job, solids, findings)
     return 0
 
 
 def _objects(_job: Job, layout: JobLayout, body: RigidBodyParameters, material_of: Materials) -> Iterator[SceneObject]:
     """A static body stands where the job puts it; the others are where the poses of the frame say."""
-    for part in parts_of(body.shape.type):
+    for part in parts_of(body.shape):
         name = body.name if part == BODY else f"{body.name}.{part}"
         file, material = layout.body_mesh(body.model, part), material_of(part)
         if body.kind == "static":
@@ -75,7 +76,7 @@ def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.
 
 def meshes_at_rest(bodies: Iterable[RigidBodyParameters]) -> tuple[ArtifactPath, ...]:
     """Files of the meshes of bodies at rest, each once."""
-    files = (JobLayout.body_mesh(body.model, part) for body in bodies for part in parts_of(body.shape.type))
+    files = (JobLayout.body_mesh(body.model, part) for body in bodies for part in parts_of(body.shape))
     return tuple(dict.fromkeys(files))
 
 
@@ -95,7 +96,7 @@ RIGID = Kind(
     parameters=RigidBodyParameters,
     about="Rigid bodies.",
     work=rigid_work,
-    material=lambda body: NATURAL_MATERIALS.get(body.shape.type, {BODY: SOLID}),
+    material=lambda body: natural_materials(body.shape),
     look_size=size_of_solid,
     boxes=boxes_of_body,
     placements=lambda job, index: iter([((), job.rigid[index])]),

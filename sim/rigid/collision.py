@@ -88,7 +88,7 @@ class CollisionDetector:
         return {
             "near_pairs": self._pairs.copy(),
             "near_budgets": self._budgets(),
-            "near_boxes": self._outer.copy(),
+            "near_boxes": np.zeros_like(self._outer) if self._must_search else self._outer.copy(),
             "near_motion": self._moved.copy(),
             "contact_starts": self._starts().copy(),
             **{

@@ -132,5 +132,7 @@ _BUILDERS: Mapping[str, Callable[..., RestShape]] = {
     "duck": lambda shape: _module("procedural").build_duck(shape.length),
     "bunny": lambda shape: _module("procedural").build_bunny(shape.height),
     "mesh": lambda shape: _module("mesh_file").load_mesh_solid(shape),
+    "compound": lambda shape: _module("assembly").build_compound(shape),
+    "piece": lambda shape: _module("cutting").build_piece(shape),
 }
 """How each type of shape is built: one line for a new shape."""
