@@ -49,6 +49,17 @@ class SceneParameters(Parameters):
         return self
 
     @model_validator(mode="after")
+    def _breaks_in_dry_air(self) -> Self:
+        other = "fluid" if self.fluid else "cloth" if self.cloth else None
+        for body in self.rigid:
+            if body.whole is not None and other is not None:
+                raise KeyRefusedError(
+                    ("rigid", body.table, "breaks"),
+                    f"is of a body in a job with {other}, which pushes pieces one by one; remove one of both",
+                )
+        return self
+
+    @model_validator(mode="after")
     def _has_one_air(self) -> Self:
         if self.smoke and (conflict := conflict_in_one_air(self.cloth)):
             raise KeyRefusedError(*conflict)

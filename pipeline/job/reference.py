@@ -56,6 +56,9 @@ def _tables() -> Iterator[tuple[str, str, schema.Node]]:
             if name.endswith(suffix):
                 type_ = definition["properties"]["type"]["const"]
                 yield f'{key} = {{ type = "{type_}", ... }}', definition["description"], definition
+                for child, property_ in definition["properties"].items():
+                    if child != "of":
+                        yield from _nested_tables(f"{key}.{child}", property_)
 
 
 def _nested_tables(path: str, property_: schema.Node) -> Iterator[tuple[str, str, schema.Node]]:

@@ -20,7 +20,7 @@ from pipeline.kinds.live_parameters import RIGID_LIVE
 from pipeline.kinds.sizes import boxes_of_body, size_of_solid
 from pipeline.kinds.work import rigid_work
 from pipeline.model.job import Job
-from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
+from pipeline.model.looks import BODY, natural_materials, parts_of
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_points
 from render.meshes import read_ply, validate_ply, with_sharp_edges, write_ply
@@ -44,11 +44,12 @@ ANIMATED_BYTES, ANIMATED_S = 1.0e6, 0.1
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
     from pipeline.kinds.checks.animated_bodies import check_animated_bodies
     from pipeline.kinds.checks.joints import check_anchors
-    from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
+    from pipeline.kinds.checks.rigid import check_ballast, check_pieces, check_places, check_rigid_start
 
     check_places(job, solids, findings)
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
+    check_pieces(job, solids, findings)
     check_anchors(job, solids, findings)
     check_animated_bodies(job, solids, findings)
     return 0
@@ -59,7 +60,7 @@ def _objects(_job: Job, layout: JobLayout, body: RigidBodyParameters, material_o
     if is_animated(body):
         yield MeshSequenceObject(name=body.name, file=ANIMATED.file_of(body.name), material=material_of(BODY))
         return
-    for part in parts_of(body.shape.type):
+    for part in parts_of(body.shape):
         name = body.name if part == BODY else f"{body.name}.{part}"
         file, material = layout.body_mesh(body.model, part), material_of(part)
         if body.kind == "static":
@@ -93,7 +94,7 @@ def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.
 def meshes_at_rest(bodies: Iterable[RigidBodyParameters]) -> tuple[ArtifactPath, ...]:
     """Files of the meshes of bodies at rest, each once; what a file animates has none."""
     still = (body for body in bodies if not is_animated(body))
-    files = (JobLayout.body_mesh(body.model, part) for body in still for part in parts_of(body.shape.type))
+    files = (JobLayout.body_mesh(body.model, part) for body in still for part in parts_of(body.shape))
     return tuple(dict.fromkeys(files))
 
 
@@ -142,7 +143,7 @@ RIGID = Kind(
     parameters=RigidBodyParameters,
     about="Rigid bodies.",
     work=rigid_work,
-    material=lambda body: NATURAL_MATERIALS.get(body.shape.type, {BODY: SOLID}),
+    material=lambda body: natural_materials(body.shape),
     look_size=size_of_solid,
     boxes=boxes_of_body,
     placements=lambda job, index: iter([((), job.rigid[index])]),

@@ -185,10 +185,11 @@ def described_material(job: Job, body: str, part: str = BODY) -> MaterialParamet
     """
     usual = _usual_material(job, body, part)
     if part != BODY and part not in WHITEWATER:
+        is_own = usual != _usual_material(job, body, BODY)
         look = (of_body := described_material(job, body)).look
         # Drops of a clear liquid are too small to refract in a picture; those of others look like it.
         keeps = (not look or LOOK_TABLE[look].refracts) if part in POINTS else look and LOOK_TABLE[look].paints_parts
-        usual = usual if keeps else of_body
+        usual = usual if keeps and is_own else of_body
     ending = "" if part == BODY else f".{part}"
     names = tuple(f"{each}{ending}" for each in dict.fromkeys((job.groups.get(body, body), body)))
     said = [job.material[written] for written in job.material if written not in names and is_meant(written, names[-1])]

@@ -13,10 +13,13 @@ MOST_SAID = 3
 
 
 def written_place(job: Job, path: KeyPath) -> KeyPath:
-    """The place in the file of a place in the job: of all bodies of a group that of their table."""
+    """The place in the file of a place in the job: of all bodies of a group, and pieces, that of their table."""
     if len(path) < 2 or path[0] != "rigid":
         return path
-    return ("rigid", job.rigid[int(path[1])].table, *path[2:])
+    body, rest = job.rigid[int(path[1])], path[2:]
+    if body.whole is not None and rest[:1] == ("shape",):
+        rest = ("shape", *(rest[2:] if rest[1:2] == ("of",) else ()))
+    return ("rigid", body.table, *rest)
 
 
 def of_tables(job: Job, problems: Iterable[Problem]) -> list[Problem]:

@@ -1,9 +1,15 @@
 """Materials of bodies for which the job file names none."""
 
+from collections.abc import Mapping
+
 from render.parameters import MaterialParameters
+from sim.shapes.parameters import CompoundShape, PieceShape, Shape
 
 BODY = "body"
 """The part of a shape that carries the body's own name."""
+
+INSIDE = "inside"
+"""The part of a piece that was inside of the whole."""
 
 _EYES = MaterialParameters(look="plastic", color=(0.01, 0.01, 0.012), roughness=0.08)
 
@@ -31,6 +37,15 @@ POINTS = {"drops": MaterialParameters(look="drops"), **WHITEWATER}
 SOLID = MaterialParameters(look="plastic")
 
 
-def parts_of(shape_type: str) -> tuple[str, ...]:
+def natural_materials(shape: Shape) -> Mapping[str, MaterialParameters]:
+    """Materials of a shape's parts, the body first, where the job file names none."""
+    if isinstance(shape, CompoundShape):
+        return dict.fromkeys((BODY, *(part.name for part in shape.part if part.name is not None)), SOLID)
+    if isinstance(shape, PieceShape):
+        return dict.fromkeys((BODY, INSIDE), SOLID)
+    return NATURAL_MATERIALS.get(shape.type, {BODY: SOLID})
+
+
+def parts_of(shape: Shape) -> tuple[str, ...]:
     """Names of a shape's parts, the body first."""
-    return tuple(NATURAL_MATERIALS.get(shape_type, {BODY: SOLID}))
+    return tuple(natural_materials(shape))

@@ -7,6 +7,7 @@ from pydantic import BaseModel
 
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
+from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.parameters import FileShape
 
 
@@ -25,9 +26,14 @@ def mesh_shapes(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, FileS
 def with_written(job: Job, path: KeyPath, new: object) -> Job:
     """A job with another value at a place of its file, for all bodies that the table there makes; none is validated."""
     if path[:1] != ("rigid",):
-        changed: Job = with_value(job, path, new)
-        return changed
-    bodies = tuple(with_value(body, path[2:], new) if body.table == path[1] else body for body in job.rigid)
+        result: Job = with_value(job, path, new)
+        return result
+
+    def changed(body: RigidBodyParameters) -> Any:
+        is_of_whole = body.whole is not None and path[2:3] == ("shape",)
+        return with_value(body, ("shape", "of", *path[3:]) if is_of_whole else path[2:], new)
+
+    bodies = tuple(changed(body) if body.table == path[1] else body for body in job.rigid)
     return job.model_copy(update={"rigid": bodies})
 
 

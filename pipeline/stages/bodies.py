@@ -51,7 +51,7 @@ class BodiesStage(Stage):
                 id=TaskId(f"bodies/{body.name}"),
                 stage=self.name,
                 inputs=(),
-                outputs=tuple(layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)),
+                outputs=tuple(layout.body_mesh(body.name, part) for part in parts_of(body.shape)),
                 parameters=ParameterSet.of(
                     stage=self.name,
                     version=self.version,
@@ -84,7 +84,7 @@ class BodiesStage(Stage):
         if isinstance(shape, MeshShape) and _is_textured(context.job, parameters):
             at_own_size = TriangleMesh(mesh.vertices / parameters.scale, mesh.faces)
             uv = texture_coordinates(at_own_size, shape)
-        for part, output in zip(parts_of(parameters.shape.type), context.task.outputs, strict=True):
+        for part, output in zip(parts_of(parameters.shape), context.task.outputs, strict=True):
             piece = mesh.piece(part)
             with context.committing(output, validate_ply) as path:
                 write_ply(path, piece.vertices, piece.faces, corner_uv=uv)

@@ -270,7 +270,7 @@ def _warn_of_flat_pictures(context: TaskContext, pictures_by_uv: Collection[str]
 def _without_coordinates(job: Job, layout: JobLayout) -> Iterator[tuple[str, str]]:
     """Objects with a .blend material and no texture coordinates: their names, and `file.blend:Name`."""
     for body in job.rigid:
-        for part in parts_of(body.shape.type):
+        for part in parts_of(body.shape):
             material = material_of(job, body.name, part)
             if material.blend is None:
                 continue

@@ -17,6 +17,7 @@ from sim.rigid.tables import kept
 from sim.shapes.balls import Balls
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.deformation import Deformation
+from sim.shapes.mesh_solid import ConvexSolid
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 from sim.shapes.revolved import Revolved
 from sim.shapes.solid import ShapeError
@@ -51,13 +52,23 @@ class CollisionShapes:
         numbers = {id(geometry): number for number, geometry in enumerate(shapes)}
         self.of_body = np.array([numbers[id(geometry)] for geometry in geometries], dtype=np.int32)
         whole, sizes = np.zeros((len(shapes), 11), dtype=np.int32), np.zeros((len(shapes), 19))
-        balls, clusters = [], []
+        found = [polytope_of(geometry) for geometry in shapes]
+        if not any(isinstance(geometry.solid.shape, ConvexSolid) for geometry in shapes):
+            # Spheres are as exact by their balls.
+            found = [
+                None if isinstance(each.solid.shape, Sphere) else own for each, own in zip(shapes, found, strict=True)
+            ]
+        # Between polytopes nobody asks for balls and distances.
+        is_asked = any(each is None for each in found)
+        balls, clusters = [np.zeros((1, 8))], [np.zeros((1, 4))]
         values, edges = [np.zeros(1, dtype=np.float32)], [np.zeros((1, 4))]
         for number, geometry in enumerate(shapes):
             shape, row, size = geometry.solid.shape, whole[number], sizes[number]
             size[kernels.CENTRE :][:3], size[kernels.LOW :][:3] = geometry.centre_of_mass, geometry.bounds[0]
             size[kernels.HIGH :][:3], size[kernels.REACH] = geometry.bounds[1], min(geometry.reach, kernels.FAR)
-            size[kernels.STEP], size[kernels.SLANT] = geometry.normal_step, SLANT
+            size[kernels.SLANT] = SLANT
+            if is_asked or geometry.is_analytic:
+                size[kernels.STEP] = geometry.normal_step
             if type(shape) in _SIZES:
                 row[kernels.KIND], size_of = _SIZES[type(shape)]
                 size[kernels.SIZE :][:3] = geometry.solid.scale * np.asarray(size_of(shape))
@@ -66,13 +77,15 @@ class CollisionShapes:
                 row[kernels.KIND], row[kernels.FIRST_EDGE] = kernels.PROFILE, sum(map(len, edges))
                 row[kernels.EDGES] = len(start)
                 edges.append(np.concatenate([start, end - start], axis=1))
-            else:
+            elif is_asked:
                 grid = geometry.grid
                 row[kernels.KIND], row[kernels.FIRST_VALUE] = kernels.GRID, sum(map(len, values))
                 row[kernels.NODES :][:3] = grid.values.shape
                 size[kernels.ORIGIN :][:3], size[kernels.SPACING] = grid.origin, grid.spacing
                 size[kernels.SLANT] = SLANT_ON_GRIDS
                 values.append(grid.values.ravel())
+            if not is_asked:
+                continue
             own = _in_clusters(geometry.balls)
             row[kernels.FIRST_BALL], row[kernels.BALLS] = sum(map(len, balls)), len(own)
             groups = _clusters_of(own)
@@ -87,14 +100,15 @@ class CollisionShapes:
             if geometry.deformation is not None
         ]
         self._tables, self._time_s = tables, -np.inf
-        self.most_balls = int(whole[:, kernels.BALLS].max())
+        self.most_balls = max(1, int(whole[:, kernels.BALLS].max()))
         if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
             raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
-        found = [polytope_of(geometry) for geometry in shapes]
         self._is_polytope = np.array([each is not None for each in found])
         self.polytopes = Polytopes(*map(kept, _tables_of(found)))
         self.most_vertices = max((len(each.vertices) for each in found if each is not None), default=0)
-        sides = np.array([[_sides(one, two) for two in shapes] for one in shapes], dtype=np.int32)
+        sides = np.zeros((len(shapes), len(shapes)), dtype=np.int32)
+        if is_asked:
+            sides[:] = [[_sides(one, two) for two in shapes] for one in shapes]
         self._sides = np.where(self._is_polytope[:, None] & self._is_polytope, 0, sides)
 
     @property

@@ -29,6 +29,7 @@ from sim.rigid.contact_solver import (
 from sim.rigid.contacts import Array, Contacts, Indices
 from sim.rigid.joint_system import JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
+from sim.rigid.parts import PartsDetector
 from sim.rigid.pile import Pile
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
@@ -66,14 +67,15 @@ class Outcome:
     iterations: int  # sweeps of the solver
     converged: bool  # whether it converged
     joint_impulses: Array  # of the joints, (r,), if there are any
+    impulses: Array  # of the contacts on their first bodies, impacts included [N s], (k, 3); a `Pile` tells none
 
 
 class ContactResponse:
     """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
 
     Attributes:
-        in_colours: whether contacts that neither bounce nor have joints, or what deforms, beside them are solved by a
-            `Pile`, many side by side: on GPUs, where islands would be solved by a thread each.
+        in_colours: whether contacts that neither bounce nor are of parts nor have joints, or what deforms, beside them
+            are solved by a `Pile`, many side by side: on GPUs, where islands would be solved by a thread each.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
@@ -83,7 +85,7 @@ class ContactResponse:
 
     def resolve(
         self,
-        detector: CollisionDetector,
+        detector: CollisionDetector | PartsDetector,
         bodies: MovingBodies,
         dt: float,
         ease: Array,
@@ -103,10 +105,11 @@ class ContactResponse:
         if not detector.active_count():
             nobody = np.zeros(n, dtype=bool)
             still = np.zeros(0 if step is None else len(step.values))
-            return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still)
+            return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still, np.zeros((0, 3)))
         if self.in_colours is None:
             self.in_colours = runs_on_gpu()
-        if self.in_colours and step is None and carried is None and not self._surfaces.restitution.any():
+        needs_islands = step is not None or carried is not None or bool(self._surfaces.restitution.any())
+        if self.in_colours and not needs_islands and isinstance(detector, CollisionDetector):
             return self._resolve_pile(detector, bodies, dt, ease)
         contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
@@ -155,6 +158,7 @@ class ContactResponse:
             impacts.iterations + solution.iterations,
             impacts.converged and solution.converged,
             by_joints + impacts.joint_impulses + solution.joint_impulses,
+            impacts.impulses + solution.impulses,
         )
 
     def _resolve_pile(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Outcome:
@@ -179,7 +183,16 @@ class ContactResponse:
         velocity, extra = self._pile.solve(ease, velocity, self._surfaces.friction, limits)
         bodies.velocity, bodies.angular_velocity = velocity[:n, :3].copy(), velocity[:n, 3:].copy()
         touched = self._pile.touched[:n]
-        return Outcome(extra, touched > 0, touched > 1, None, self._pile.sweeps, self._pile.converged, NO_IMPULSES)
+        return Outcome(
+            extra,
+            touched > 0,
+            touched > 1,
+            None,
+            self._pile.sweeps,
+            self._pile.converged,
+            NO_IMPULSES,
+            np.zeros((0, 3)),
+        )
 
     def _bounce(
         self,

@@ -35,7 +35,8 @@ Array = NDArray[np.float64]
 def with_groups(tables: tuple[RigidBodyParameters, ...]) -> tuple[RigidBodyParameters, ...]:
     """All bodies of a job's tables: those of a group in place of its table, named `NAME_1`, `NAME_2` and so on.
 
-    Each knows the place of its table. What are bodies already stays as it is.
+    Each knows the place of its table. Bodies that break are there as their pieces. What are bodies already stays as it
+    is.
 
     Raises:
         KeyRefusedError: the bodies of a group have no room, or no names.
@@ -45,10 +46,10 @@ def with_groups(tables: tuple[RigidBodyParameters, ...]) -> tuple[RigidBodyParam
     for number, table in enumerate(tables):
         if table.is_placed:
             bodies.append(table)
-        elif table.count is None:
-            bodies.append(table.placed(number))
-        else:
-            bodies.extend(_members(table, number, scattered))
+            continue
+        members = [table.placed(number)] if table.count is None else _members(table, number, scattered)
+        for body in members:
+            bodies.extend(body.broken_down())
     return tuple(bodies)
 
 

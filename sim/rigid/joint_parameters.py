@@ -204,6 +204,7 @@ def joint_problems(
 ) -> Iterator[JointProblem]:
     """Joints that cannot be, of bodies that may not be there; cloths by name."""
     kinds = {body.name: body.kind for body in bodies}
+    pieces = {body.name for body in bodies if body.whole is not None}
     names: dict[str, int] = {}
     held: dict[frozenset[str], list[JointParameters]] = {}
     for number, joint in enumerate(joints):
@@ -219,6 +220,10 @@ def joint_problems(
                 continue
             known = f"rigid bodies are {', '.join(kinds)}" if kinds else "add [[rigid]]"
             yield JointProblem(number, "between", f'names no rigid body with "{unknown[0]}"; {known}')
+            continue
+        if breaking := [name for name in joint.between if name in pieces]:
+            sentence = f'holds "{breaking[0]}", a piece of a body that breaks, which no joint can; remove one of both'
+            yield JointProblem(number, "between", sentence)
             continue
         if all(kinds[name] != "dynamic" for name in joint.between):
             told = " and ".join(f'"{name}" is {kinds[name]}' for name in joint.between)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import prod
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -9,8 +10,9 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
 from sim.core.parameters import BodyName, Fraction, KeyRefusedError, NonNegative, Positive, Vector3
+from sim.rigid.break_parameters import BreakParameters
 from sim.rigid.group_parameters import CurveParameters, JitterParameters, ScatterParameters
-from sim.shapes.parameters import AnimationShape, WeightedPlacement
+from sim.shapes.parameters import AnimationShape, PieceShape, WeightedPlacement
 
 MOST_OF_A_GROUP = 100_000
 PLACES = ("spacing", "along", "scatter")
@@ -55,6 +57,10 @@ class RigidBodyParameters(WeightedPlacement):
     interpolation: Literal["cubic", "linear"] = Field(
         default="cubic",
         description="Between keyframes. cubic: velocities are continuous; linear: they are constant and jump.",
+    )
+
+    breaks: BreakParameters | None = Field(
+        default=None, description="Pieces that the body breaks into; a dynamic body without it never breaks."
     )
 
     # A group's keys are spent once its bodies are there, so that nothing of them is in what decides a frame.
@@ -102,6 +108,12 @@ class RigidBodyParameters(WeightedPlacement):
     _table: int | None = PrivateAttr(default=None)
     _group: str | None = PrivateAttr(default=None)
     _model: str | None = PrivateAttr(default=None)
+    _whole: str | None = PrivateAttr(default=None)
+
+    @property
+    def whole(self) -> str | None:
+        """Name of the body that it is a piece of."""
+        return self._whole
 
     @property
     def is_placed(self) -> bool:
@@ -142,11 +154,23 @@ class RigidBodyParameters(WeightedPlacement):
         if model is not None:
             spent = ("count", "spacing", "along", "scatter", "jitter", "scales")
             body = self.model_copy(update={**dict.fromkeys(spent), "offset": (0.0, 0.0, 0.0), "seed": 0, **values})
-            body._group, body._model = self.name, model
+            body._group, body._model = self.group, model
         else:
             body = self.model_copy()
         body._table = table
         return body
+
+    def broken_down(self) -> Iterator[Self]:
+        """The pieces of a body of a job that breaks, where they are in it; else the body itself."""
+        if self.breaks is None or self._whole is not None:
+            yield self
+            return
+        pieces, seed = self.breaks.pieces, self.breaks.seed
+        for number in range(1, 1 + (pieces or len(getattr(self.shape, "part", ())))):
+            shape = PieceShape(type="piece", of=self.shape, pieces=pieces, seed=seed, number=number)
+            piece = self.placed(self.table, model=f"{self.model}_{number}", name=f"{self.name}_{number}", shape=shape)
+            piece._whole = self.name
+            yield piece
 
     @model_validator(mode="before")
     @classmethod
@@ -165,6 +189,15 @@ class RigidBodyParameters(WeightedPlacement):
             )
         if self.kind != "dynamic" and self.ballast:
             raise ValueError(f'a {self.kind} body has no mass for ballast to add to; remove it or use kind = "dynamic"')
+        if self.breaks is not None:
+            if self.kind != "dynamic":
+                raise KeyRefusedError(("breaks",), f'has no meaning for a {self.kind} body; use kind = "dynamic"')
+            if self.ballast:
+                raise KeyRefusedError(("ballast",), "is in no piece of a body that breaks; make it a part of one")
+            if self.breaks.pieces is None and (self.shape.type != "compound" or len(self.shape.part) < 2):
+                raise KeyRefusedError(
+                    ("breaks", "pieces"), "is missing; only a compound of two parts or more has pieces without it"
+                )
         if self.kind != "kinematic" and self.keyframe:
             raise ValueError(f'a {self.kind} body has no keyframes; remove them or use kind = "kinematic"')
         for key in ("velocity", "angular_velocity"):

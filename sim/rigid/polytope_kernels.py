@@ -47,7 +47,7 @@ NEAREST = ((1 << (FEATURE_BITS - WALL_BITS - VERTEX_BITS - 1)) - 1) << (VERTEX_B
 
 @bundle
 class Polytopes(NamedTuple):
-    """Shapes that are polytopes, each once; others have no vertices."""
+    """Shapes that are polytopes, each once; others have no vertices, and balls have one, and no faces."""
 
     whole: WholeRows  # whole numbers, by the columns above, (s, 4)
     radii: Numbers  # by which they are rounded [m], (s,)
@@ -298,9 +298,11 @@ def candidates_of_pair(
             side, own, other = 1, second, first
             face = own_face
         outward = vector_at(polytopes.planes, face, 0)
-        own_face, _ = nearest_face(-turned(bodies.pose, other, outward), own, bodies, polytopes)
         own_radius, other_radius = polytopes.radii[bodies.shape[own]], polytopes.radii[bodies.shape[other]]
-        there, count = clip_faces(begin, room, own, other, own_face, face, bodies, polytopes, work)
+        there, count = begin, 0
+        if polytopes.whole[bodies.shape[own], FACES] > 0:  # a ball has none
+            own_face, _ = nearest_face(-turned(bodies.pose, other, outward), own, bodies, polytopes)
+            there, count = clip_faces(begin, room, own, other, own_face, face, bodies, polytopes, work)
         least = ti.cast(FAR, ti.f64)
         for corner in range(there, there + count):
             centre = vector_at(work, corner, 0)

@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from sim.rigid.contacts import Array, Indices
 from sim.shapes.balls import BALL_DEPTH
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.mesh_solid import MeshSolid
-from sim.shapes.primitives import Box
+from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
+from sim.shapes.primitives import Box, Sphere
 
 CONVEX = 1.0e-6  # part of the hull's volume that a mesh may lack and be taken for convex
 SAME = 1.0e-9  # by how much planes and vertices of one face may differ, in the body's size
@@ -31,15 +31,18 @@ class Polytope:
 
 
 def polytope_of(geometry: BodyGeometry) -> Polytope | None:
-    """The polytope of a body, if it is one of few faces: as balls under its surface have it, edges are rounded."""
+    """The polytope of a body, if it is one of few faces: as balls under its surface have it, edges are rounded.
+
+    A sphere is one of a single corner.
+    """
     shape = geometry.solid.shape
-    if geometry.deformation is not None or not isinstance(shape, Box | MeshSolid):
+    if geometry.deformation is not None:
         return None
-    try:
-        hull = ConvexHull(geometry.solid.rest_mesh().vertices - geometry.centre_of_mass)
-    except QhullError:
-        return None
-    if isinstance(shape, MeshSolid) and hull.volume - geometry.solid.volume > CONVEX * hull.volume:
+    if isinstance(shape, Sphere):
+        none = np.zeros(0, dtype=np.int64)
+        return Polytope(geometry.solid.scale * shape.radius, np.zeros((1, 3)), np.zeros((0, 4)), none, none)
+    hull = _convex_hull(geometry) if isinstance(shape, Box | MeshSolid) else None
+    if hull is None:
         return None
     size, radius = float(np.ptp(hull.points, axis=0).max()), BALL_DEPTH * geometry.shortest_edge
     planes = _distinct(hull.equations * [1.0, 1.0, 1.0, 1.0 / size]) * [1.0, 1.0, 1.0, size]
@@ -59,6 +62,16 @@ def polytope_of(geometry: BodyGeometry) -> Polytope | None:
     return Polytope(
         radius, vertices, planes[kept] * [1.0, 1.0, 1.0, -1.0], np.concatenate([loops[k] for k in kept]), counts
     )
+
+
+def _convex_hull(geometry: BodyGeometry) -> ConvexHull | None:
+    """The hull of a body that is convex, in its frame."""
+    try:
+        hull = ConvexHull(geometry.solid.rest_mesh().vertices - geometry.centre_of_mass)
+    except QhullError:
+        return None
+    is_known = isinstance(geometry.solid.shape, Box | ConvexSolid)
+    return hull if is_known or hull.volume - geometry.solid.volume <= CONVEX * hull.volume else None
 
 
 def _distinct(rows: Array) -> Array:

@@ -21,9 +21,11 @@ from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
 from sim.rigid.contact_solver import NOT_CARRIED, Carried
 from sim.rigid.contacts import Contacts, Indices
+from sim.rigid.glue import MOST_ROUNDS, Glue
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.parts import PartsDetector, detector_of
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
@@ -73,6 +75,7 @@ class RigidSolver:
         walls: closed faces of the domain.
         joints: between the bodies, or None.
         deforming: deformations of the bodies that have one, by their number.
+        glue: between the pieces of bodies that break, or None.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
         has_own_steps: whether fast bodies divide the step of all; nothing that is coupled to them shares it then.
 
@@ -112,7 +115,8 @@ class RigidSolver:
         self.all_names = tuple(body.name for body in everybody)
         self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
-        self._detector = CollisionDetector(self.all_geometries, self.walls, len(self.solids))
+        make = detector_of if self.bodies.is_dynamic.any() else CollisionDetector
+        self._detector = make(self.all_geometries, self.walls, len(self.solids))
         self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
@@ -121,7 +125,9 @@ class RigidSolver:
         corners = np.array([domain.min, domain.max])
         self._chooser = StepChooser(self.all_geometries, self.bodies, self.walls, self._detector, self.gravity)
         self.joints = Joints(joints, everybody, self.bodies) if joints else None
-        self._obey_joints()
+        has_pieces = any(body.whole is not None for body in parameters)
+        self.glue = Glue(parameters, self.solids, self.bodies) if has_pieces else None
+        self._obey_links()
         self.has_own_steps = False
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
@@ -192,26 +198,55 @@ class RigidSolver:
         self._place_kinematic_bodies(self.time_s)
         self._stop_lost_bodies()
 
-    def _advance(self, dt: float, time_s: float, is_active: NDArray[np.bool_], halvings: int = MOST_HALVINGS) -> None:
-        """Advance free bodies, (n,), by dt [s], and kinematic ones from a time [s] on; by halves if joints ask it."""
-        bodies = self.bodies
+    def _advance(
+        self,
+        dt: float,
+        time_s: float,
+        is_active: NDArray[np.bool_],
+        halvings: int = MOST_HALVINGS,
+        rounds: int = MOST_ROUNDS,
+    ) -> None:
+        """Advance free bodies, (n,), by dt [s], and kinematic ones from a time [s] on; by halves if joints ask it.
+
+        Where bodies break, the step is taken again from its start by what is left of them, in some rounds.
+        """
+        self._set_mean_velocities_of_kinematic_bodies(time_s, dt)
+        bodies, glue, everybody = self.bodies, self.glue, is_active
+        if glue is not None:
+            glue.gather()
+            bodies, is_active = glue.movers, is_active & glue.is_leader
+        poses_before = (self.bodies.position.copy(), self.bodies.orientation.copy())
         before = (bodies.position.copy(), bodies.orientation.copy())
         velocities = (bodies.velocity, bodies.angular_velocity.copy())
         free = is_active[:, None]
         bodies.velocity = bodies.velocity + np.where(free, dt * self.gravity, 0.0)
-        self._set_mean_velocities_of_kinematic_bodies(time_s, dt)
-        moves = is_active | ~bodies.is_dynamic
+        if glue is not None:
+            glue.scatter()
+        moves = everybody | ~bodies.is_dynamic
         reach = self._with_obstacles(np.where(moves, dt * self._surface_speeds(), 0.0))
-        among = np.append(is_active, np.zeros(len(self._fixed_position) - 1, dtype=bool))
+        among = np.append(everybody, np.zeros(len(self._fixed_position) - 1, dtype=bool))
         ease = np.zeros((len(bodies) + 1, 7))
         bodies.describe(is_active, self._pose, ease)
-        joints = self.joints
+        if glue is not None:
+            self.bodies.describe(everybody, self._pose, np.zeros_like(ease))
+        joints, unstopped = self.joints, (bodies.velocity, bodies.angular_velocity)
         self._detector.find(self._poses_described(), reach, among, time_s)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
         carried = partial(self._carried, time_s=time_s + 0.5 * dt) if self.deforming else None
         outcome = self._response.resolve(self._detector, bodies, dt, ease, joints, step, carried)
         if outcome.forces is not None:
             self._detector.keep_forces(outcome.forces)
+        if glue is not None and isinstance(self._detector, PartsDetector):
+            contacts, pieces = self._detector.contacts(), self._detector.pieces
+            broken = glue.overloaded(contacts, pieces, outcome.impulses, unstopped, dt, everybody)
+            if len(broken) and rounds > 0:
+                bodies.velocity, bodies.angular_velocity = velocities
+                glue.scatter()
+                glue.split(broken)
+                self._obey_links()
+                self._advance(dt, time_s, everybody, halvings, rounds - 1)
+                return
+            glue.settle()
         self._contact_count = self._detector.active_count()
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
@@ -233,7 +268,7 @@ class RigidSolver:
                 bodies.position, bodies.orientation = before
                 bodies.velocity, bodies.angular_velocity = velocities
                 for half in range(2):
-                    self._advance(0.5 * dt, time_s + half * 0.5 * dt, is_active, halvings - 1)
+                    self._advance(0.5 * dt, time_s + half * 0.5 * dt, everybody, halvings - 1)
                 return
 
         # One that a fluid pushed is touched as well: the fluid is to see how it moves.
@@ -241,13 +276,15 @@ class RigidSolver:
         bodies.fly_on(
             dt, self.gravity, outcome.extra, is_active=is_active, is_touched=is_touched, is_held=outcome.is_held
         )
+        if glue is not None:
+            glue.scatter()
         self._place_kinematic_bodies(time_s + dt)
-        self._detector.follow(self._with_obstacles(self._surface_motion_since(*before)))
+        self._detector.follow(self._with_obstacles(self._surface_motion_since(*poses_before)))
         if joints is not None and hold is not None:
             broken = int(joints.is_broken.sum())
             joints.settle(hold, bodies, is_active, bodies.inverse_inertia())
             if int(joints.is_broken.sum()) > broken:
-                self._obey_joints()
+                self._obey_links()
 
     def _carried(self, contacts: Contacts, time_s: float) -> Carried:
         """The sides of contacts that are on surfaces that deform, with their velocities at a time [s]."""
@@ -266,11 +303,19 @@ class RigidSolver:
                 found.append((rows, np.full(len(rows), side), led))
         return Carried(*map(np.concatenate, zip(*found, strict=True))) if found else NOT_CARRIED
 
-    def _obey_joints(self) -> None:
-        """Tell who looks for contacts, and who chooses steps, what joints hold together now."""
+    def _obey_links(self) -> None:
+        """Tell who looks for contacts, and who chooses steps, what joints and glue hold together now."""
+        links = []
         if self.joints is not None:
             self._detector.untouching = self.joints.untouching()
-            self._chooser.links = self.joints.links()
+            links.append(self.joints.links())
+        if self.glue is not None and isinstance(self._detector, PartsDetector):
+            stands = np.arange(len(self.bodies), len(self.all_names))
+            self._detector.glue(np.concatenate([self.glue.leader, stands]))
+            links.append(self.glue.links())
+        if links:
+            first, second = (np.concatenate(each) for each in zip(*links, strict=True))
+            self._chooser.links = first, second
 
     def _awake(self, dt: float) -> NDArray[np.bool_]:
         """Bodies that do not sleep, (n,), after those were woken that what moves may meet in dt [s], and so on."""
@@ -284,6 +329,8 @@ class RigidSolver:
             met[meetings.first] = met[meetings.second] = True
             if self.joints is not None:
                 met[: len(bodies)] |= self.joints.beside(moves)
+            if self.glue is not None:
+                met[: len(bodies)] |= np.bincount(self.glue.leader, weights=moves)[self.glue.leader] > 0.0
             woken = met[: len(bodies)] & bodies.is_asleep
             if not woken.any():
                 break
@@ -303,8 +350,7 @@ class RigidSolver:
         meetings = self._chooser.meetings(self.poses(), dt, ~bodies.is_asleep)
         first, second = (np.minimum(numbers, n) for numbers in (meetings.first, meetings.second))
         free, leads = np.append(awake, False), np.append(~bodies.is_dynamic & (speeds > 0.0), False)
-        if self.joints is not None:
-            first, second = (np.concatenate(each) for each in zip((first, second), self._chooser.links, strict=True))
+        first, second = (np.concatenate(each) for each in zip((first, second), self._chooser.links, strict=True))
         links = free[first] & free[second]
         groups = groups_of(first[links], second[links], n)
         restless = np.zeros(n, dtype=bool)
@@ -346,6 +392,8 @@ class RigidSolver:
         if not 0.0 < factor < math.inf:
             raise ValueError(f'the mass of "{name}" can only be scaled by a finite number above 0, got {factor:g}')
         self.bodies.scale_mass(number, factor)
+        if self.glue is not None:
+            self.glue.weigh()
         self._wake_all()
 
     def set_surface(self, name: str, *, friction: float | None = None, restitution: float | None = None) -> None:
@@ -412,6 +460,9 @@ class RigidSolver:
         away = np.sqrt(np.square(self.bodies.position - self._domain_centre).sum(axis=1))
         lost = self.bodies.is_free & (away > LOST_DISTANCE * self._domain_diagonal)
         if lost.any():
+            if self.glue is not None:
+                lost = np.bincount(self.glue.leader, weights=lost)[self.glue.leader] > 0.0
+                self.glue.movers.is_lost |= lost
             self.bodies.is_lost |= lost
             self.bodies.velocity[lost] = 0.0
             self.bodies.angular_velocity[lost] = 0.0
@@ -474,6 +525,7 @@ class RigidSolver:
             **{name: getattr(self.bodies, name).copy() for name in _STATE},
             **self._detector.checkpoint(),
             **({} if self.joints is None else self.joints.checkpoint()),
+            **({} if self.glue is None else self.glue.checkpoint()),
             "clock": np.array([self.time_s]),
         }
 
@@ -486,10 +538,12 @@ class RigidSolver:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}, got {found}")
         if self.joints is not None:
             self.joints.restore(arrays)
-            self._obey_joints()
-        self._detector.restore(arrays)
         for name in _STATE:
             setattr(self.bodies, name, np.array(arrays[name], dtype=getattr(self.bodies, name).dtype))
+        if self.glue is not None:
+            self.glue.restore(arrays)
+        self._obey_links()
+        self._detector.restore(arrays)
         self.time_s = float(arrays["clock"][0])
 
     def diagnostics(self) -> Diagnostics:
@@ -507,6 +561,7 @@ class RigidSolver:
         angular = spin + np.cross(bodies.position[free], momentum)
         kinetic = 0.5 * (np.sum(momentum * bodies.velocity[free]) + np.sum(spin * bodies.angular_velocity[free]))
         of_joints = {} if self.joints is None else self.joints.diagnostics()
+        of_glue = {} if self.glue is None else {"faces_broken": float(np.count_nonzero(self.glue.is_broken))}
         return {
             "mass": float(mass.sum()),
             **_by_axis("momentum", momentum.sum(axis=0)),
@@ -520,6 +575,7 @@ class RigidSolver:
             "not_converged": float(self._not_converged),
             "bodies_lost": float(np.count_nonzero(bodies.is_lost)),
             **of_joints,
+            **of_glue,
         }
 
     def remedies(self) -> Remedies:

@@ -58,9 +58,7 @@ class MovingBodies:
         self.is_asleep, self.rest_s, self.deforming = np.zeros(n, dtype=bool), np.zeros(n), np.zeros(n)
         self._inverse_tensor = np.zeros((n, 3, 3))
         self._inverse_tensor[self.is_dynamic] = np.linalg.inv(self._tensor[self.is_dynamic])
-        self.principal_moments, axes = np.linalg.eigh(self._tensor)
-        axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
-        self.principal_orientation = np.stack([rotation.from_matrix(each) for each in axes])
+        self.principal_moments, self.principal_orientation = _principal(self._tensor)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -85,6 +83,18 @@ class MovingBodies:
         self._tensor[number] *= factor
         self._inverse_tensor[number] /= factor
         self.principal_moments[number] *= factor
+
+    def set_inertia(self, number: int, mass: float, tensor: Array) -> None:
+        """Give a dynamic body another mass [kg] and inertia tensor about its centre in its own axes [kg m²], (3, 3)."""
+        self.mass[number], self._tensor[number] = mass, tensor
+        self._inverse_tensor[number] = np.linalg.inv(tensor)
+        moments, orientation = _principal(tensor[None])
+        self.principal_moments[number], self.principal_orientation[number] = moments[0], orientation[0]
+
+    @property
+    def tensors(self) -> Array:
+        """Inertia tensors about the centres of mass in the bodies' own axes [kg m²], (n, 3, 3)."""
+        return self._tensor
 
     def rotation(self) -> Array:
         """Rotation matrices, body axes to world axes, (n, 3, 3)."""
@@ -171,6 +181,13 @@ class MovingBodies:
         self.wake(pushed | angular.any(axis=1))
         self.velocity = self.velocity + self.inverse_mass[:, None] * linear
         self.angular_velocity = self.angular_velocity + np.einsum("nij,nj->ni", self.inverse_inertia(), angular)
+
+
+def _principal(tensors: Array) -> tuple[Array, Array]:
+    """Principal moments, (n, 3), and the turns of principal axes, (n, 4), of inertia tensors, (n, 3, 3)."""
+    moments, axes = np.linalg.eigh(tensors)
+    axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
+    return moments, np.stack([rotation.from_matrix(each) for each in axes])
 
 
 def turned_freely(

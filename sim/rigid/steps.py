@@ -14,6 +14,7 @@ from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Array, Indices
+from sim.rigid.parts import PartsDetector
 from sim.rigid.states import MovingBodies
 from sim.shapes.body_geometry import BodyGeometry
 
@@ -48,7 +49,7 @@ class StepChooser:
         geometries: Sequence[BodyGeometry],
         bodies: MovingBodies,
         walls: Sequence[Wall],
-        detector: CollisionDetector,
+        detector: CollisionDetector | PartsDetector,
         gravity: Array,
     ) -> None:
         """Take the moving bodies, which come first among the geometries."""
@@ -117,7 +118,7 @@ class StepChooser:
             return []
         if self.needs_none(dt):
             return [(1, is_free)]
-        if self._is_calm(poses, dt, is_free):
+        if isinstance(self._detector, CollisionDetector) and self._is_calm(self._detector, poses, dt, is_free):
             return [(1, is_free)]
         groups, counts = self._counts(self.meetings(poses, dt, is_active), dt, is_free)
         speeds = bodies.surface_speeds(self._radius[: len(bodies)])
@@ -128,7 +129,7 @@ class StepChooser:
             _, counts = self._counts(self.meetings(poses, dt, is_active, faster), dt, is_free)
         return [(int(count), is_free & (counts == count)) for count in np.unique(counts[is_free])]
 
-    def _is_calm(self, poses: Poses, dt: float, is_free: NDArray[np.bool_]) -> bool:
+    def _is_calm(self, detector: CollisionDetector, poses: Poses, dt: float, is_free: NDArray[np.bool_]) -> bool:
         """Whether no free body may get too far in dt [s]: a look from above at what `meetings` finds exactly."""
         from sim.rigid.step_kernels import Speeds, count_fast
 
@@ -140,7 +141,7 @@ class StepChooser:
         still = len(self._edge) + 1 - n
         own = bodies.surface_speeds(self._radius[:n])
         motion = np.append(own * dt + 0.5 * acceleration * dt * dt, np.zeros(still))
-        self._detector.look(poses, motion)
+        detector.look(poses, motion)
         speeds = Speeds(
             np.concatenate([bodies.velocity, np.zeros((still, 3))]),
             np.append(spin * self._radius[:n] + bodies.deforming, np.zeros(still)),
@@ -149,13 +150,11 @@ class StepChooser:
             np.append(is_free, np.zeros(still)).astype(np.int32),
             np.append(self._radius, 0.0),
         )
-        near, _, moving, _ = self._detector.on_device()
-        if not self._detector.pair_count:
+        near, _, moving, _ = detector.on_device()
+        if not detector.pair_count:
             return True
         fast = np.zeros(1, dtype=np.int32)
-        count_fast(
-            self._detector.pair_count, near.pairs, moving.pose, self._detector.walls, speeds, dt, acceleration, fast
-        )
+        count_fast(detector.pair_count, near.pairs, moving.pose, detector.walls, speeds, dt, acceleration, fast)
         return not fast[0]
 
     def _counts(self, meetings: Meetings, dt: float, is_free: NDArray[np.bool_]) -> tuple[Indices, Indices]:

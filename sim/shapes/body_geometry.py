@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.shapes.assembly import Assembly
 from sim.shapes.balls import Balls, exact_balls, surface_balls
+from sim.shapes.convex_pieces import convex_pieces
 from sim.shapes.distance_grids import sampled_distances
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, mass_properties_of_solid
-from sim.shapes.mesh_solid import MeshSolid
-from sim.shapes.parameters import AnimationShape, WeightedPlacement
+from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
+from sim.shapes.parameters import AnimationShape, BallastParameters, WeightedPlacement
 from sim.shapes.placement import PlacedSolid, build_solid
 from sim.shapes.solid import Points
 
@@ -39,20 +41,56 @@ class BodyGeometry:
     def __init__(self, parameters: WeightedPlacement) -> None:
         """Build the shape; raises ShapeError where that is impossible, or it is too thin to have an inside."""
         placed = build_solid(parameters)
-        self.solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
         self.deformation = _deformation_of(parameters, placed)
-        self._of_unit_density = _mass_properties(self.solid)
-        self._ballast = parameters.ballast
         # Without ballast the centre is that of the shape, and bodies without mass have one too.
-        self.centre_of_mass = self.mass_properties(parameters.density or 1.0).centre_of_mass
+        self._take(placed, parameters.ballast, parameters.density or 1.0)
+
+    @classmethod
+    def of(cls, placed: PlacedSolid) -> BodyGeometry:
+        """That of a solid without ballast, wherever it is."""
+        geometry = cls.__new__(cls)
+        geometry.deformation = None
+        geometry._take(placed, (), 1.0)
+        return geometry
+
+    def _take(self, placed: PlacedSolid, ballast: tuple[BallastParameters, ...], density: float) -> None:
+        self.solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
+        self._materials, self._ballast = _materials(self.solid), ballast
+        self.centre_of_mass = self.mass_properties(density).centre_of_mass
 
     def mass_properties(self, density: float) -> MassProperties:
-        """Mass [kg], centre of mass [m] and inertia about it [kg m²], ballast included, in the frame of `solid`."""
-        unit = self._of_unit_density
-        properties = MassProperties(density * unit.mass, unit.centre_of_mass, density * unit.inertia)
+        """Mass [kg], centre of mass [m] and inertia about it [kg m²], ballast included, in the frame of `solid`.
+
+        Parts of a compound that have a density of their own keep it.
+        """
+        parts = [
+            MassProperties(rho * unit.mass, unit.centre_of_mass, rho * unit.inertia)
+            for unit, rho in ((unit, own or density) for unit, own in self._materials)
+        ]
+        properties = reduce(MassProperties.joined, parts)
         for ballast in self._ballast:
             properties = properties.with_point_mass(ballast.mass, ballast.position)
         return properties
+
+    @cached_property
+    def contact_parts(self) -> tuple[ContactPart, ...]:
+        """The solids that stand for the body in contacts: itself, those of an assembly, or convex pieces of a mesh."""
+        shape, scale = self.solid.shape, self.solid.scale
+        solids: tuple[PlacedSolid, ...] = ()
+        if isinstance(shape, Assembly):
+            solids = shape.solids
+        elif isinstance(shape, MeshSolid) and not isinstance(shape, ConvexSolid) and self.deformation is None:
+            solids = convex_pieces(shape)
+        if not solids:
+            return (ContactPart(self, np.zeros(3), np.eye(3)),)
+        found = []
+        for solid in solids:
+            geometry = BodyGeometry.of(PlacedSolid(solid.shape, scale * solid.scale, np.eye(3), np.zeros(3)))
+            position = scale * solid.position + solid.rotation @ geometry.centre_of_mass - self.centre_of_mass
+            for part in geometry.contact_parts:
+                turned = solid.rotation @ part.rotation
+                found.append(ContactPart(part.geometry, position + solid.rotation @ part.position, turned))
+        return tuple(found)
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -65,11 +103,13 @@ class BodyGeometry:
         """Largest distance of its box's corners from the centre of mass [m]."""
         return float(np.linalg.norm(np.abs(self.bounds).max(axis=0)))
 
-    @property
+    @cached_property
     def shortest_edge(self) -> float:
-        """Shortest edge of its box [m]."""
+        """Shortest edge of its box [m]; of an assembly that of its parts."""
         if self.deformation is not None:
             return self.deformation.shortest_edge
+        if isinstance(self.solid.shape, Assembly):
+            return min(part.geometry.shortest_edge for part in self.contact_parts)
         return float(np.min(self.bounds[1] - self.bounds[0]))
 
     def signed_distance(self, points: Points) -> NDArray[np.float64]:
@@ -129,6 +169,27 @@ def _deformation_of(parameters: WeightedPlacement, placed: PlacedSolid) -> Defor
 
     assert isinstance(placed.shape, AnimatedSolid), "an animation is built as one"
     return None if placed.shape.deformed is None else Deformation(placed.shape, parameters.shape, placed.scale)
+
+
+class ContactPart(NamedTuple):
+    """A solid that stands for a body, or a part of it, in contacts."""
+
+    geometry: BodyGeometry
+    position: NDArray[np.float64]  # of its centre of mass in the body's frame [m], (3,)
+    rotation: NDArray[np.float64]  # its axes to the body's, (3, 3)
+
+
+def _materials(solid: PlacedSolid) -> list[tuple[MassProperties, float | None]]:
+    """Mass properties at 1 kg/m³ of what has one density each, and that density where it is not the body's."""
+    shape = solid.shape
+    if not isinstance(shape, Assembly) or shape.densities is None:
+        return [(_mass_properties(solid), None)]
+    found = []
+    for part, density in zip(shape.solids, shape.densities, strict=True):
+        own = PlacedSolid(part.shape, solid.scale * part.scale, np.eye(3), np.zeros(3))
+        for unit, inner in _materials(own):
+            found.append((unit.placed(part.rotation, solid.scale * part.position), inner or density))
+    return found
 
 
 def _mass_properties(solid: PlacedSolid) -> MassProperties:

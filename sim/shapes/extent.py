@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from sim.shapes.parameters import (
     BoxShape,
     CapsuleShape,
+    CompoundShape,
     ConeShape,
     CylinderShape,
+    PieceShape,
     RevolvedShape,
     Shape,
     SphereShape,
@@ -37,6 +39,13 @@ def ball_around(shape: Shape) -> float | None:
     elif isinstance(shape, RevolvedShape):
         heights = [height for _, height in shape.profile]
         radius = _length((max(each for each, _ in shape.profile), 0.5 * (max(heights) - min(heights))))
+    elif isinstance(shape, CompoundShape):
+        reaches = [(ball_around(part.shape), part.scale, _length(part.position)) for part in shape.part]
+        if any(around is None for around, _, _ in reaches):
+            return None
+        radius = max(away + scale * (around or 0.0) for around, scale, away in reaches)
+    elif isinstance(shape, PieceShape):
+        return ball_around(shape.of)
     elif shape.type == "duck":
         radius = DUCK_BALL * shape.length
     elif shape.type == "bunny":

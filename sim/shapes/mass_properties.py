@@ -29,6 +29,17 @@ class MassProperties:
         inertia = self.inertia + reduced * (offset @ offset * np.eye(3) - np.outer(offset, offset))
         return MassProperties(total, self.centre_of_mass + mass / total * offset, inertia)
 
+    def joined(self, other: MassProperties) -> MassProperties:
+        """Both bodies as one."""
+        whole = self.with_point_mass(other.mass, other.centre_of_mass)
+        return MassProperties(whole.mass, whole.centre_of_mass, whole.inertia + other.inertia)
+
+    def placed(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> MassProperties:
+        """The same body turned by a matrix, (3, 3), then moved [m], (3,)."""
+        return MassProperties(
+            self.mass, rotation @ self.centre_of_mass + position, rotation @ self.inertia @ rotation.T
+        )
+
 
 def mass_properties_of_mesh(mesh: TriangleMesh, density: float) -> MassProperties:
     """Mass properties of what a mesh without overlapping parts encloses (Eberly 2002, "Polyhedral mass properties").

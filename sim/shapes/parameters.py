@@ -148,6 +148,42 @@ class AnimationShape(FileShape):
         return self
 
 
+MOST_PIECES = 500
+
+
+class CompoundShape(Parameters):
+    """Several shapes that are one body, such as a hammer of a box and a cylinder; about the origin of its parts.
+
+    Parts keep their own exact distances in contacts. Where they overlap, their masses add up.
+    """
+
+    type: Literal["compound"]
+    part: Annotated[tuple[PartParameters, ...], Field(min_length=1, max_length=MOST_PIECES)] = Field(
+        description="Its parts."
+    )
+
+    @model_validator(mode="after")
+    def _has_a_first_part_of_the_body_itself(self) -> Self:
+        names = [part.name for part in self.part if part.name is not None]
+        if self.part[0].name is not None:
+            raise KeyRefusedError(("part", 0, "name"), "of the first part is that of the body; remove it")
+        if "body" in names or "inside" in names:
+            raise KeyRefusedError(("part",), 'names of parts cannot be "body" or "inside", which have a meaning')
+        return self
+
+
+class PieceShape(Parameters):
+    """One of the pieces that a shape is cut into, where it is in the shape; `[rigid.breaks]` makes them."""
+
+    type: Literal["piece"]
+    of: Shape = Field(description="The whole shape.")
+    pieces: Annotated[int, Field(ge=2, le=MOST_PIECES)] | None = Field(
+        default=None, description="How many there are [-]; the parts of a compound if omitted."
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(default=0, description="Of the random points that they lie around.")
+    number: Annotated[int, Field(ge=1, le=MOST_PIECES)] = Field(description="Which of them this is, from 1 [-].")
+
+
 Shape = Annotated[
     BoxShape
     | SphereShape
@@ -159,7 +195,9 @@ Shape = Annotated[
     | DuckShape
     | BunnyShape
     | MeshShape
-    | AnimationShape,
+    | AnimationShape
+    | CompoundShape
+    | PieceShape,
     Field(discriminator="type"),
 ]
 
@@ -180,6 +218,27 @@ class Placement(Parameters):
         if isinstance(self.shape, AnimationShape) and not self.may_be_animated:
             raise KeyRefusedError(("shape", "type"), "is for bodies of [[rigid]] alone; take a mesh of one moment")
         return self
+
+
+class PartParameters(Placement):
+    """A part of a compound: a shape, where it is in the body, and what it is made of."""
+
+    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Of the shape's centre, in the body's axes [m].")
+    rotation_deg: Vector3 = Field(
+        default=(0.0, 0.0, 0.0), description="Rotation about the body's x, then y, then z axis [degrees]."
+    )
+    density: Annotated[float, Field(ge=1e-3, le=1e6)] | None = Field(
+        default=None, description="Mass per volume [kg/m³]; the body's if omitted."
+    )
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")] | None = Field(
+        default=None,
+        description='Name of the part, by which it has a material of its own, as [material."hammer.handle"]; '
+        "the first is the body itself.",
+    )
+
+
+for _model in (CompoundShape, PieceShape, Placement, PartParameters):
+    _model.model_rebuild()
 
 
 class BallastParameters(Parameters):

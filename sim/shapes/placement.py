@@ -133,5 +133,7 @@ _BUILDERS: Mapping[str, Callable[..., RestShape]] = {
     "bunny": lambda shape: _module("procedural").build_bunny(shape.height),
     "mesh": lambda shape: _module("mesh_file").load_mesh_solid(shape),
     "animation": lambda shape: _module("animation").load_animation(shape),
+    "compound": lambda shape: _module("assembly").build_compound(shape),
+    "piece": lambda shape: _module("cutting").build_piece(shape),
 }
 """How each type of shape is built: one line for a new shape."""

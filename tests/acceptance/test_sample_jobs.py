@@ -13,6 +13,7 @@ JOBS = sorted((PROJECT / "jobs").glob("*.toml"))
 
 TINY = {
     "ball_into_cloth": {"cloth.sheet.shape.counts": [9, 9]},
+    "breaking_vase": {"rigid.vase.breaks.pieces": 4},
     "brick_wall_in_flood": {"fluid.water.particle_radius": 0.025, "rigid.brick.count": [1, 5, 2]},
     "campfire": {"smoke.fire.cell_size": 0.04},
     "cloth_over_bunny": {"cloth.veil.shape.counts": [11, 11]},

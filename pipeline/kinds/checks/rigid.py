@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.kinds.base import Solids
 from pipeline.model.boxes import domain_box, overlap, simulated_regions, span
 from pipeline.model.job import Job
-from pipeline.model.problems import Findings
+from pipeline.model.problems import Findings, Problem
 from sim.rigid.joint_parameters import joint_problems
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import start_problems
@@ -41,6 +41,23 @@ def check_ballast(job: Job, solids: Solids, findings: Findings) -> None:
                     f"lies {distance:.3g} m outside of the body, whose shape spans {span(unturned.bounds)}; "
                     "give it in metres from the shape's centre, before the body is turned",
                 )
+
+
+def check_pieces(job: Job, solids: Solids, findings: Findings) -> None:
+    """Note the number and sizes of the pieces of each body that breaks."""
+    wholes: dict[str, dict[int, float]] = {}
+    for index, body in enumerate(job.rigid):
+        solid = solids.get(("rigid", index))
+        if body.whole is not None and solid is not None:
+            wholes.setdefault(body.whole, {})[index] = solid.volume
+    for whole, volumes in wholes.items():
+        smallest = min(volumes, key=volumes.__getitem__)
+        mean = sum(volumes.values()) / len(volumes)
+        sentence = (
+            f'"{whole}" has {len(volumes)} pieces, the smallest, "{job.rigid[smallest].name}", of '
+            f"{1e6 * volumes[smallest]:.3g} cm³, the mean of {1e6 * mean:.3g} cm³"
+        )
+        findings.facts.append(Problem(("rigid", smallest, "breaks"), sentence))
 
 
 def check_rigid_start(job: Job, solids: Solids, findings: Findings) -> None:

@@ -13,7 +13,7 @@ from pipeline.model.amounts import count, gigabytes
 from pipeline.model.boxes import Box
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, suggestion
-from sim.shapes.parameters import FileShape, Placement
+from sim.shapes.parameters import CompoundShape, FileShape, PieceShape, Placement
 
 OUT_OF_SCALE = 30.0
 """A mesh so many times larger than the scene is not meant: a cell of its grid of distances is a tenth of the scene."""
@@ -86,6 +86,11 @@ def in_scale(solids: Solids, regions: Sequence[Box], findings: Findings) -> Soli
 
 def mesh_exists(shape: object, path: KeyPath, findings: Findings) -> bool:
     """Whether the shape of a table needs no file, or its file is there; notes what is wrong."""
+    if isinstance(shape, PieceShape):
+        return mesh_exists(shape.of, path, findings)
+    if isinstance(shape, CompoundShape):
+        there = [mesh_exists(part.shape, (*path, "shape", "part", n), findings) for n, part in enumerate(shape.part)]
+        return all(there)
     return not isinstance(shape, FileShape) or file_exists(shape.file, "mesh", (*path, "shape", "file"), findings)
 
 

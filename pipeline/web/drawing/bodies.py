@@ -90,7 +90,7 @@ def meshes_at_rest(body: RigidBodyParameters) -> dict[tuple[str, str], Mesh]:
     Raises ValueError, OSError: the file of its shape is damaged or gone.
     """
     mesh = build_solid(body).rest_mesh()
-    pieces = {part: mesh.piece(part) for part in parts_of(body.shape.type)}
+    pieces = {part: mesh.piece(part) for part in parts_of(body.shape)}
     return {
         (body.name, part): (piece.vertices.astype(np.float32), piece.faces.astype(np.uint32))
         for part, piece in pieces.items()
@@ -201,7 +201,7 @@ def _draw_parts(canvas: Canvas, name: str, pose: Pose | Sheet, setting: Setting)
         canvas.mesh(f"/{pose.kind}/{name}/{BODY}", pose.position, pose.triangles, color)
         return
     parameters = setting.parameters(pose, name)
-    for part in () if parameters is None else parts_of(parameters.shape.type):
+    for part in () if parameters is None else parts_of(parameters.shape):
         mesh = setting.mesh(parameters.model, part)
         if mesh is not None:
             color, path = color_of(setting.job, name, part, BODY_COLOR), f"/{pose.kind}/{name}/{part}"

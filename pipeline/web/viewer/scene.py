@@ -92,7 +92,7 @@ class JobScene:
         for body in self._job.rigid:
             if not body.is_own_model or is_animated(body):
                 continue
-            files = [self._layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
+            files = [self._layout.body_mesh(body.name, part) for part in parts_of(body.shape)]
             try:
                 built |= {} if all(map(self._committed.is_there, files)) else meshes_at_rest(body)
             except (ValueError, OSError) as error:

@@ -40,7 +40,9 @@ def problems_of(text: str, tmp_path: Path, *overrides: str, preview: bool = Fals
 
 RIGID = '[[rigid]]\nname = "r"\n'
 CLOTH = '[[cloth]]\nname = "c"\nshape = {type = "rectangle", size = [1.0, 1.0], counts = [9, 9]}\n'
-SHAPES = "types are box, sphere, cylinder, capsule, torus, cone, revolved, duck, bunny, mesh, animation"
+SHAPES = (
+    "types are box, sphere, cylinder, capsule, torus, cone, revolved, duck, bunny, mesh, animation, compound, piece"
+)
 
 BAD = {
     # Keys that are not there.

@@ -65,7 +65,8 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
-    example, many, led, pouring, joints, cloth, smoke, limits = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    examples = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    example, many, hammer, vase, led, pouring, joints, cloth, smoke, limits = examples
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")
@@ -78,6 +79,8 @@ def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     }
     (tmp_path / "led.toml").write_text(f'name = "led"\nframes = 2\n{led}')
     assert load_job(tmp_path / "led.toml").rigid[0].shape.type == "animation"
+    (tmp_path / "broken.toml").write_text(f'name = "broken"\n{hammer}{vase}')
+    assert Counter(body.group for body in load_job(tmp_path / "broken.toml").rigid) == {"hammer": 1, "vase": 80}
     jug = '[[rigid]]\nname = "jug"\nkind = "kinematic"\nshape = { type = "capsule", radius = 0.035, height = 0.11 }\n'
     poured = example.replace("[[rigid]]", f"{pouring}\n{jug}\n[[rigid]]", 1)
     (tmp_path / "poured.toml").write_text(poured)

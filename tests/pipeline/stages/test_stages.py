@@ -338,8 +338,9 @@ def test_a_duck_comes_in_parts_with_colours_of_their_own():
 
 @pytest.mark.parametrize("shape", ["duck", "bunny"])
 def test_the_parts_that_have_looks_are_those_that_the_shape_has(shape):
-    mesh = build_solid(Placement.model_validate({"shape": {"type": shape}})).rest_mesh()
-    assert parts_of(shape) == mesh.part_names
+    placement = Placement.model_validate({"shape": {"type": shape}})
+    mesh = build_solid(placement).rest_mesh()
+    assert parts_of(placement.shape) == mesh.part_names
     pieces = [mesh.piece(part) for part in mesh.part_names]
     assert sum(len(piece.faces) for piece in pieces) == len(mesh.faces)
     # The cut changes no triangle, so the volumes under the pieces' faces add up to float64 rounding.

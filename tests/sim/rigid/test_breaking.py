@@ -1,0 +1,253 @@
+"""Bodies of several shapes, and bodies that break: exact masses, stresses that formulas give, momenta that stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from rigid_scenes import SPACE, advance, ball, body, cube, in_room, in_space, totals
+
+from sim.core.parameters import KeyRefusedError
+from sim.rigid.groups import with_groups
+from sim.rigid.joint_parameters import JointParameters, joint_problems
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.solver import RigidSolver
+from sim.rigid.start import start_problems
+from sim.scene import SceneParameters
+from sim.shapes.body_geometry import BodyGeometry
+
+LENGTH, EDGE, DENSITY = 1.0, 0.1, 2000.0
+MODULUS = EDGE**3 / 6.0
+"""Of a section of a beam [m³]: bending moment over stress."""
+
+
+def compound(*parts: dict) -> dict:
+    return {"type": "compound", "part": tuple(parts)}
+
+
+def beam(count: int, *, strength: float, impact_s: float = 1.0e-3, **keys) -> list[RigidBodyParameters]:
+    """A beam along x of so many glued boxes."""
+    box = {"type": "box", "size": (LENGTH / count, EDGE, EDGE)}
+    middles = (np.arange(count) + 0.5) * LENGTH / count - 0.5 * LENGTH
+    shape = compound(*({"shape": box, "position": (float(x), 0.0, 0.0)} for x in middles))
+    breaks = {"strength": strength, "impact_s": impact_s}
+    return list(with_groups((body("beam", shape, density=DENSITY, friction=0.0, breaks=breaks, **keys),)))
+
+
+def knife(x: float) -> RigidBodyParameters:
+    return body("knife", {"type": "box", "size": (0.002, EDGE, 0.2)}, (x, 0.0, 0.1), kind="static", friction=0.0)
+
+
+def broken(solver: RigidSolver) -> list[int]:
+    assert solver.glue is not None
+    return np.flatnonzero(solver.glue.is_broken).tolist()
+
+
+# --- bodies of several shapes ---
+
+
+def test_a_compound_weighs_what_its_parts_do():
+    head, handle, rho = np.array([0.1, 0.03, 0.04]), np.array([0.02, 0.02, 0.3]), (7800.0, 700.0)
+    at = np.array([[0.01, 0.0, 0.2], [0.0, 0.0, 0.03]])
+    parts = [
+        {"shape": {"type": "box", "size": tuple(edges)}, "position": tuple(place), "density": density}
+        for edges, place, density in zip((head, handle), at, rho, strict=True)
+    ]
+    found = BodyGeometry(body("hammer", compound(*parts))).mass_properties(500.0)
+    mass = np.array([np.prod(head) * rho[0], np.prod(handle) * rho[1]])
+    centre = mass @ at / mass.sum()
+    inertia = np.zeros((3, 3))
+    for edges, weight, arm in zip((head, handle), mass, at - centre, strict=True):
+        inertia += weight / 12.0 * (edges @ edges * np.eye(3) - np.diag(edges**2))
+        inertia += weight * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    assert found.mass == pytest.approx(mass.sum(), rel=1e-12)
+    assert found.centre_of_mass == pytest.approx(centre, rel=1e-12, abs=1e-15)
+    assert found.inertia == pytest.approx(inertia, rel=1e-10, abs=1e-15)
+
+
+def test_round_parts_have_exact_volumes_and_overlaps_are_told_of():
+    rod = {"shape": {"type": "cylinder", "radius": 0.01, "height": 0.2}}
+    apart = BodyGeometry(body("dumbbell", compound(rod, {"shape": ball(0.03), "position": (0.0, 0.0, 0.13)}))).solid
+    assert apart.volume == pytest.approx(np.pi * 1e-4 * 0.2 + 4.0 / 3.0 * np.pi * 0.03**3, rel=1e-12)
+    assert not apart.warnings
+    inside = BodyGeometry(body("dumbbell", compound(rod, {"shape": ball(0.03), "position": (0.0, 0.0, 0.1)}))).solid
+    assert "overlap" in inside.warnings[0]
+
+
+def test_a_compound_is_hollow_where_its_parts_leave_room():
+    """A bridge over a post rests on it with its deck: its hull would lie on the post long before."""
+    deck = {"shape": {"type": "box", "size": (0.3, 0.1, 0.04)}, "position": (0.0, 0.0, 0.12)}
+    legs = [{"shape": {"type": "box", "size": (0.04, 0.1, 0.1)}, "position": (x, 0.0, 0.05)} for x in (-0.13, 0.13)]
+    post = body("post", {"type": "box", "size": (0.18, 0.08, 0.2)}, (0.0, 0.0, 0.1), kind="static")
+    bridge = body("bridge", compound(deck, *legs), (0.0, 0.0, 0.11))
+    solver = in_room(bridge, obstacles=[post])
+    assert not start_problems(solver)
+    advance(solver, 0.6)
+    assert float(solver.view("bridge")["position"][2]) == pytest.approx(0.1, abs=2e-5)
+
+
+# --- pieces ---
+
+
+@pytest.mark.parametrize("shape", [cube(0.2), {"type": "torus", "major_radius": 0.1, "minor_radius": 0.03}])
+def test_pieces_fill_their_whole_and_do_not_overlap(shape):
+    def pieces(seed: int) -> list[RigidBodyParameters]:
+        return list(with_groups((body("pot", shape, breaks={"strength": 1e6, "pieces": 20, "seed": seed}),)))
+
+    whole, made = BodyGeometry(body("pot", shape)).solid, pieces(3)
+    geometries = [BodyGeometry(each) for each in made]
+    volumes = np.array([each.solid.volume for each in geometries])
+    assert [each.name for each in made] == [f"pot_{number}" for number in range(1, 21)]
+    assert volumes.sum() == pytest.approx(whole.rest_mesh().signed_volume, rel=1e-12)
+    assert volumes.min() > 0.1 * volumes.mean()
+    again = [BodyGeometry(each).solid.volume for each in pieces(4)]
+    assert not np.allclose(volumes, again)
+    assert not start_problems(in_space(*made))
+    mass = sum(each.mass_properties(500.0).mass for each in geometries)
+    assert mass == pytest.approx(500.0 * whole.rest_mesh().signed_volume, rel=1e-12)
+
+
+def test_a_body_that_holds_flies_as_one_of_one_piece():
+    spin = {"angular_velocity": (3.0, 0.2, 1.0), "velocity": (0.3, 0.0, 0.1)}
+    shape = {"type": "box", "size": (LENGTH, EDGE, EDGE)}
+    whole, glued = in_space(body("beam", shape, density=DENSITY, **spin)), in_space(*beam(5, strength=1e12, **spin))
+    for solver in (whole, glued):
+        advance(solver, 1.0, 2e-3)
+    middle = glued.view("beam_3")
+    for name, values in whole.view("beam").items():
+        assert np.abs(middle[name] - values).max() < 1e-9, name
+    assert glued.diagnostics()["kinetic_energy"] == pytest.approx(whole.diagnostics()["kinetic_energy"], rel=1e-9)
+
+
+# --- stresses ---
+
+
+@pytest.mark.parametrize(("share", "breaks"), [(0.98, True), (1.02, False)])
+def test_a_beam_breaks_under_its_weight_where_and_when_beam_theory_says(share, breaks):
+    """On two supports M = g rho A (L s - L²/2) / 4 in the middle, s being their distance; within 2 %."""
+    weight = DENSITY * 9.81 * EDGE * EDGE * LENGTH
+    half_span = 0.499
+    stress = weight * (0.5 * half_span - LENGTH / 8.0) / MODULUS
+    supports = [knife(x).model_copy(update={"name": f"knife{x:g}"}) for x in (-half_span, half_span)]
+    solver = in_room(*beam(10, strength=share * stress, position=(0.0, 0.0, 0.25)), obstacles=supports)
+    advance(solver, 0.04)
+    assert broken(solver) == ([4] if breaks else [])
+
+
+@pytest.mark.parametrize("dt", [2e-3, 7e-4])
+@pytest.mark.parametrize(("share", "breaks"), [(1.03, True), (0.97, False)])
+def test_a_beam_that_falls_across_a_knife_breaks_from_one_speed_on(share, breaks, dt):
+    """F = m v / impact_s on its middle third: F L / 18 and F / 3 at the faces beside; within 3 %, at any step."""
+    impact_s, strength = 2e-3, 4e6
+    bending, shear = LENGTH / 18.0 / MODULUS, 1.0 / (3.0 * EDGE * EDGE)
+    force = strength / (0.5 * bending + np.sqrt(0.25 * bending**2 + shear**2))
+    speed = share * force * impact_s / (DENSITY * LENGTH * EDGE * EDGE)
+    falling = beam(3, strength=strength, impact_s=impact_s, position=(0.0, 0.0, 0.2587), velocity=(0.0, 0.0, -speed))
+    solver = RigidSolver(falling, obstacles=[knife(0.0)], domain=SPACE, gravity=(0.0, 0.0, 0.0))
+    advance(solver, 0.02 / speed, dt)
+    assert broken(solver) == ([0, 1] if breaks else [])
+
+
+@pytest.mark.parametrize(("share", "breaks"), [(1.01, True), (0.99, False)])
+def test_what_spins_bursts_at_its_speed_and_keeps_its_momenta(share, breaks):
+    """A rod about its middle: rho omega² L² / 8."""
+    strength = 1.0e5
+    omega = share * np.sqrt(8.0 * strength / (DENSITY * LENGTH**2))
+    solver = in_space(*beam(4, strength=strength, angular_velocity=(0.0, 0.0, omega), velocity=(0.1, 0.2, -0.3)))
+    before = totals(solver, "momentum"), totals(solver, "angular_momentum")
+    energy = solver.diagnostics()["kinetic_energy"]
+    advance(solver, 0.05)
+    assert (1 in broken(solver)) == breaks
+    after = totals(solver, "momentum"), totals(solver, "angular_momentum")
+    for one, two in zip(before, after, strict=True):
+        assert np.abs(two - one).max() < 1e-12 * np.abs(one).max()
+    assert solver.diagnostics()["kinetic_energy"] == pytest.approx(energy, rel=1e-9)
+
+
+def test_a_blow_that_breaks_keeps_momentum_and_adds_no_energy():
+    breaks = {"strength": 3e4, "pieces": 12, "seed": 2}
+    shot = body("shot", ball(0.04), (-0.4, 0.02, 1.0), density=7800.0, velocity=(6.0, 0.0, 0.0))
+    (*pieces,) = with_groups((body("block", cube(0.2), (0.0, 0.0, 1.0), density=2000.0, breaks=breaks),))
+    solver = in_space(shot, *pieces)
+    before, turning = totals(solver, "momentum"), totals(solver, "angular_momentum")
+    energy = solver.diagnostics()["kinetic_energy"]
+    while not broken(solver) and solver.time_s < 0.1:
+        advance(solver, 0.002)
+    assert len(set(solver.glue.leader.tolist())) > 3
+    assert np.abs(totals(solver, "momentum") - before).max() < 1e-12 * np.abs(before).max()
+    assert np.abs(totals(solver, "angular_momentum") - turning).max() < 1e-12 * np.abs(turning).max()
+    advance(solver, 0.05)
+    assert np.abs(totals(solver, "momentum") - before).max() < 1e-12 * np.abs(before).max()
+    # Moving overlapping pieces apart turns them without a moment.
+    assert np.abs(totals(solver, "angular_momentum") - turning).max() < 1e-5 * np.abs(turning).max()
+    assert solver.diagnostics()["kinetic_energy"] < energy
+
+
+def test_pieces_come_to_rest_and_sleep():
+    breaks = {"strength": 1e5, "pieces": 8, "seed": 1}
+    (*pieces,) = with_groups((body("block", cube(0.1), (0.0, 0.0, 0.6), density=2000.0, breaks=breaks),))
+    solver = in_room(*pieces)
+    advance(solver, 3.0)
+    assert len(set(solver.glue.leader.tolist())) > 1
+    assert solver.bodies.is_asleep.all()
+    assert solver.diagnostics()["max_penetration"] < 1e-4
+
+
+def test_a_restart_breaks_on_with_the_same_bits():
+    def scene() -> RigidSolver:
+        breaks = {"strength": 5e4, "pieces": 10, "seed": 5}
+        (*pieces,) = with_groups(
+            (body("pot", cube(0.1), (0.0, 0.0, 0.3), rotation_deg=(20.0, 30.0, 0.0), density=2000.0, breaks=breaks),)
+        )
+        return in_room(*pieces)
+
+    straight = scene()
+    advance(straight, 0.21, 1e-3)
+    continued = scene()
+    continued.restore(straight.checkpoint())
+    for solver in (straight, continued):
+        advance(solver, 0.15, 1e-3)
+    assert len(broken(straight)) > 2
+    expected, found = straight.checkpoint(), continued.checkpoint()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(array, found[name], err_msg=name)
+
+
+# --- what is refused ---
+
+
+@pytest.mark.parametrize(
+    ("keys", "path"),
+    [
+        ({"kind": "static", "breaks": {"strength": 1e6, "pieces": 4}}, ("breaks",)),
+        ({"density": 500.0, "breaks": {"strength": 1e6}}, ("breaks", "pieces")),
+        (
+            {
+                "density": 500.0,
+                "breaks": {"strength": 1e6, "pieces": 4},
+                "ballast": ({"mass": 1.0, "position": (0, 0, 0)},),
+            },
+            ("ballast",),
+        ),
+    ],
+)
+def test_what_cannot_break_is_refused(keys, path):
+    with pytest.raises(ValidationError) as refused:
+        RigidBodyParameters(name="pot", shape=cube(0.1), **{"kind": "dynamic", **keys})
+    assert refused.value.errors()[0]["ctx"]["error"].path == path
+
+
+def test_joints_fluids_and_cloths_do_not_go_with_what_breaks():
+    breaks = {"strength": 1e6, "pieces": 2}
+    pieces = with_groups((body("pot", cube(0.1), breaks=breaks),))
+    joint = JointParameters(name="nail", kind="ball", between=("pot_1",), anchor=(0.0, 0.0, 0.0))
+    (problem,) = joint_problems([joint], pieces)
+    assert "pot_1" in problem.text
+    sheet = {"type": "rectangle", "size": (0.4, 0.4), "counts": (5, 5)}
+    with pytest.raises(ValidationError) as refused:
+        SceneParameters.model_validate(
+            {"rigid": (body("pot", cube(0.1), breaks=breaks),), "cloth": ({"name": "flag", "shape": sheet},)}
+        )
+    error = refused.value.errors()[0]["ctx"]["error"]
+    assert isinstance(error, KeyRefusedError)
+    assert error.path == ("rigid", 0, "breaks")
