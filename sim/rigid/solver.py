@@ -503,7 +503,7 @@ class RigidSolver:
         }
 
     def view(self, body: str) -> dict[str, NDArray[np.generic]]:
-        """Pose and velocities of a body, as in its snapshot: copies, of 13 numbers."""
+        """Pose and velocities of a body, and its mesh if a file animates it, as in its snapshot: copies."""
         return dict(self.snapshots()[body].arrays)
 
     def push(self, body: str, change: NDArray[np.floating]) -> None:
