@@ -19,7 +19,7 @@ from sim.shapes.parameters import BallastParameters, WeightedPlacement
 from sim.shapes.placement import PlacedSolid, build_solid
 from sim.shapes.solid import Points
 
-GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh
+GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh; half of them in a convex piece of one
 GRID_PADDING = 0.1  # how far a distance grid reaches past its mesh, in longest edges
 
 
@@ -137,7 +137,8 @@ class BodyGeometry:
     def grid(self) -> LevelSet:
         """Distances of a mesh as contacts read them, in the frame of `solid`."""
         longest = float(np.max(self.bounds[1] - self.bounds[0]))
-        return LevelSet.sample(self.solid, longest / GRID_CELLS, padding=GRID_PADDING * longest)
+        cells = GRID_CELLS // 2 if isinstance(self.solid.shape, ConvexSolid) else GRID_CELLS
+        return LevelSet.sample(self.solid, longest / cells, padding=GRID_PADDING * longest)
 
 
 class ContactPart(NamedTuple):
