@@ -23,7 +23,7 @@ from sim.shapes.solid import Points
 if TYPE_CHECKING:
     from sim.shapes.deformation import Deformation
 
-GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh
+GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh; half of them in a convex piece of one
 GRID_PADDING = 0.1  # how far a distance grid reaches past its mesh, in longest edges
 
 
@@ -152,7 +152,8 @@ class BodyGeometry:
         if self.deformation is not None:
             return self.deformation.level_set(0.0)
         longest = float(np.max(self.bounds[1] - self.bounds[0]))
-        return LevelSet.sample(self.solid, longest / GRID_CELLS, padding=GRID_PADDING * longest)
+        cells = GRID_CELLS // 2 if isinstance(self.solid.shape, ConvexSolid) else GRID_CELLS
+        return LevelSet.sample(self.solid, longest / cells, padding=GRID_PADDING * longest)
 
     @cached_property
     def fine_grid(self) -> LevelSet:

@@ -11,6 +11,8 @@ from pipeline.model.problems import Findings, Problem
 from sim.rigid.joint_parameters import joint_problems
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import start_problems
+from sim.rigid.steps import groups_of
+from sim.shapes.parameters import PieceShape
 from sim.shapes.solid import ShapeError
 
 # Share of a body's size by which ballast on its surface may be outside, as decimals do not add up exactly.
@@ -44,7 +46,9 @@ def check_ballast(job: Job, solids: Solids, findings: Findings) -> None:
 
 
 def check_pieces(job: Job, solids: Solids, findings: Findings) -> None:
-    """Note the number and sizes of the pieces of each body that breaks."""
+    """Note the number and sizes of the pieces of each body that breaks; warn of those that nothing glues."""
+    from sim.shapes.cutting import cut_of
+
     wholes: dict[str, dict[int, float]] = {}
     for index, body in enumerate(job.rigid):
         solid = solids.get(("rigid", index))
@@ -58,6 +62,17 @@ def check_pieces(job: Job, solids: Solids, findings: Findings) -> None:
             f"{1e6 * volumes[smallest]:.3g} cm³, the mean of {1e6 * mean:.3g} cm³"
         )
         findings.facts.append(Problem(("rigid", smallest, "breaks"), sentence))
+        shape = job.rigid[smallest].shape
+        assert isinstance(shape, PieceShape), "pieces are made by what breaks"
+        faces = cut_of(shape).faces
+        first, second = (np.array([getattr(face, side) for face in faces], int) for side in ("first", "second"))
+        count = int(groups_of(first, second, len(volumes)).max()) + 1
+        if count > 1:
+            findings.warn(
+                ("rigid", smallest, "breaks"),
+                f'"{whole}" is in {count} from the start: only plane faces that lie on each other are glued; move '
+                "parts until they touch by one",
+            )
 
 
 def check_rigid_start(job: Job, solids: Solids, findings: Findings) -> None:

@@ -81,6 +81,14 @@ def test_a_job_tells_of_its_pieces_and_draws_their_insides(tmp_path):
     assert "3 pieces" in fact.message
 
 
+def test_parts_that_nothing_glues_are_told_of(tmp_path):
+    breaks = "breaks = { strength = 1e6 }\n"
+    assert not checked(ROOM + HAMMER + breaks, tmp_path / "broken.toml").warnings
+    (warning,) = checked(ROOM + HAMMER.replace("-0.115", "-0.12") + breaks, tmp_path / "broken.toml").warnings
+    assert "rigid[0].breaks" in warning
+    assert "in 2 from the start" in warning
+
+
 def test_parts_look_like_their_body_unless_they_are_said_to_differ(tmp_path):
     looks = '[material.hammer]\nlook = "plastic"\ncolor = [0.5, 0.1, 0.1]\n'
     job = read_job(job_file(tmp_path, HAMMER + looks)).job

@@ -86,6 +86,19 @@ def test_a_compound_is_hollow_where_its_parts_leave_room():
     assert float(solver.view("bridge")["position"][2]) == pytest.approx(0.1, abs=2e-5)
 
 
+def test_compounds_that_a_joint_holds_do_not_touch_each_other():
+    box = {"shape": {"type": "box", "size": (0.1, 0.1, 0.1)}}
+    pair = compound(box, {**box, "position": (0.15, 0.0, 0.0)})
+    bodies = body("first", pair, (0.0, 0.0, 1.0)), body("second", pair, (0.05, 0.0, 1.0))
+    hinge = JointParameters(name="axle", kind="hinge", between=("first", "second"), anchor=(0, 0, 1), axis=(0, 1, 0))
+    apart = RigidSolver(bodies, domain=SPACE, gravity=(0.0, 0.0, 0.0))
+    assert start_problems(apart)
+    joined = RigidSolver(bodies, joints=[hinge], domain=SPACE, gravity=(0.0, 0.0, 0.0))
+    assert not start_problems(joined)
+    advance(joined, 0.02)
+    assert joined.diagnostics()["contacts"] == 0.0
+
+
 # --- pieces ---
 
 
@@ -191,6 +204,21 @@ def test_pieces_come_to_rest_and_sleep():
     assert len(set(solver.glue.leader.tolist())) > 1
     assert solver.bodies.is_asleep.all()
     assert solver.diagnostics()["max_penetration"] < 1e-4
+
+
+def test_what_wakes_a_piece_wakes_all_that_it_is_glued_to():
+    block = beam(4, strength=1e12, position=(0.0, 0.0, 0.5 * EDGE))
+    shot = body("shot", ball(0.05), (1.2, 0.0, 0.05), density=7800.0, velocity=(-0.001, 0.0, 0.0))
+    solver = in_room(*block, shot)
+    advance(solver, 0.8)
+    assert solver.bodies.is_asleep[:4].all()
+    push = np.array([-2.0, 0.0, 0.0])
+    solver.push("shot", push)
+    advance(solver, 0.5)
+    assert not solver.bodies.is_asleep[:4].any()
+    velocities = solver.bodies.velocity[:4]
+    assert velocities[0, 0] < -0.05
+    assert np.abs(velocities - velocities[0]).max() < 1e-3
 
 
 def test_a_restart_breaks_on_with_the_same_bits():
