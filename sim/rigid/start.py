@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.motion.paths import Poses
-from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.broad_phase import overlapping_on_host
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.solver import RigidSolver
 from sim.shapes.body_geometry import BodyGeometry
@@ -42,7 +42,7 @@ def _overlaps(solver: RigidSolver) -> list[StartProblem]:
     """Pairs of bodies of which one is dynamic, with the exact distance of the balls found to overlap."""
     poses, geometries = solver.poses(), solver.all_geometries
     is_dynamic = np.append(solver.bodies.is_dynamic, np.zeros(len(geometries) - len(solver.bodies), dtype=bool))
-    pairs = solver.touching(*overlapping_pairs(*CollisionDetector(geometries, (), 0).boxes(poses), is_dynamic))
+    pairs = solver.touching(*overlapping_on_host(*CollisionDetector(geometries, (), 0).boxes(poses), is_dynamic))
     deepest: dict[tuple[int, int], tuple[float, NDArray[np.float64]]] = {}
     for first, second in zip(*(numbers.tolist() for numbers in pairs), strict=True):
         for owner, other in ((first, second), (second, first)):
