@@ -87,16 +87,17 @@ class CollisionDetector:
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The contacts that are being followed: bodies that rest on others than before would tremble."""
+        starts, rows = self._followed()
         return {
             "near_pairs": self._pairs.copy(),
             "near_budgets": self._budgets(),
             # Boxes that are to be searched anew lie in none.
             "near_boxes": np.full_like(self._outer, kernels.FAR) if self._must_search else self._outer.copy(),
             "near_motion": self._moved.copy(),
-            "contact_starts": self._starts().copy(),
+            "contact_starts": starts,
             **{
-                f"contact_{name}": copied(getattr(self._kept, name))[: self._total]
-                if self._total
+                f"contact_{name}": copied(getattr(self._kept, name))[rows]
+                if len(rows)
                 else np.zeros((0, COLUMNS[name]))
                 for name in ("features", "planes", "balls", "forces")
             },
@@ -284,13 +285,16 @@ class CollisionDetector:
     def _budgets(self) -> Array:
         return copied(self._near.budget)[: len(self._pairs)] if len(self._pairs) else np.zeros(0)
 
-    def _starts(self) -> NDArray[np.int32]:
-        """Where contacts of each of the pairs begin, and the end, (p + 1,)."""
-        # Where pairs were searched for since contacts were, these are of the pairs before.
-        if not self._total or self._is_renewed:
-            return np.zeros(len(self._pairs) + 1, dtype=np.int32)
-        starts: NDArray[np.int32] = viewed(self._kept.starts)[: len(self._pairs) + 1]
-        return starts
+    def _followed(self) -> tuple[NDArray[np.int32], Indices]:
+        """Where contacts of each of the pairs begin, and the end, (p + 1,), and which they are, (c,)."""
+        if not self._total:
+            return np.zeros(len(self._pairs) + 1, dtype=np.int32), np.zeros(0, dtype=np.int64)
+        # They are of the pairs that they were last looked for in.
+        before, starts = copied(self._near.before)[: len(self._pairs)], copied(self._kept.starts)
+        counts = np.where(before >= 0, starts[before + 1] - starts[before], 0)
+        ends = np.append(0, np.cumsum(counts))
+        rows = np.repeat(starts[before] - ends[:-1], counts) + np.arange(ends[-1])
+        return ends.astype(np.int32), rows
 
     # --- arrays on the device ---
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.motion.paths import Poses
+from sim.rigid.broad_phase import overlapping_on_host
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.solver import RigidSolver
 from sim.shapes.body_geometry import BodyGeometry
@@ -41,7 +42,7 @@ def _overlaps(solver: RigidSolver) -> list[StartProblem]:
     """Pairs of bodies of which one is dynamic, with the exact distance of the balls found to overlap."""
     poses, geometries = solver.poses(), solver.all_geometries
     is_dynamic = np.append(solver.bodies.is_dynamic, np.zeros(len(geometries) - len(solver.bodies), dtype=bool))
-    pairs = solver.touching(*_overlapping(*CollisionDetector(geometries, (), 0).boxes(poses), is_dynamic))
+    pairs = solver.touching(*overlapping_on_host(*CollisionDetector(geometries, (), 0).boxes(poses), is_dynamic))
     deepest: dict[tuple[int, int], tuple[float, NDArray[np.float64]]] = {}
     for first, second in zip(*(numbers.tolist() for numbers in pairs), strict=True):
         for owner, other in ((first, second), (second, first)):
@@ -72,23 +73,6 @@ def _overlaps(solver: RigidSolver) -> list[StartProblem]:
         )
         problems.append(StartProblem(solver.all_names[mover], sentence))
     return problems
-
-
-def _overlapping(
-    lower: NDArray[np.float64], upper: NDArray[np.float64], is_dynamic: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """As `broad_phase.overlapping_pairs`, without a kernel: jobs are checked before a device is chosen."""
-    axis = int(np.argmax(np.std(lower, axis=0)))
-    order = np.argsort(lower[:, axis], kind="stable")
-    ends = np.searchsorted(lower[order, axis], upper[order, axis], side="right")
-    pairs = [np.zeros((0, 2), dtype=np.int64)]
-    for place, one in enumerate(order.tolist()):
-        others = order[place + 1 : ends[place]]
-        near = np.all((lower[one] <= upper[others]) & (lower[others] <= upper[one]), axis=1)
-        found = others[near & (is_dynamic[one] | is_dynamic[others])]
-        pairs.append(np.stack([np.minimum(one, found), np.maximum(one, found)], axis=1))
-    first, second = np.unique(np.concatenate(pairs), axis=0).T
-    return first, second
 
 
 def _way_out(

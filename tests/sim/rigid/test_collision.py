@@ -7,7 +7,7 @@ from rigid_scenes import ball, body, cube, in_room, in_space
 from scipy.optimize import nnls
 
 from sim.core.domain import DomainParameters
-from sim.rigid.broad_phase import overlapping_pairs
+from sim.rigid.broad_phase import overlapping_on_host, overlapping_pairs
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Contacts
 from sim.rigid.polytopes import polytope_of
@@ -125,14 +125,15 @@ def test_a_body_in_a_corner_of_the_domain_has_contacts_with_each_wall():
     assert len(np.unique(found.keys())) == len(found) >= 8
 
 
+@pytest.mark.parametrize("overlapping", [overlapping_pairs, overlapping_on_host])
 @pytest.mark.parametrize("floor", [False, True])
-def test_the_broad_phase_finds_what_comparing_all_pairs_finds(floor):
+def test_the_broad_phase_finds_what_comparing_all_pairs_finds(floor, overlapping):
     random = np.random.default_rng(4)
     centre, half = random.uniform(0, 1, (300, 3)), random.uniform(0.005, 0.1, (300, 3))
     if floor:  # one that is far larger
         centre[7], half[7] = (0.5, 0.5, -1.0), (5.0, 5.0, 1.1)
     is_active = random.uniform(size=300) < 0.6
-    first, second = overlapping_pairs(centre - half, centre + half, is_active)
+    first, second = overlapping(centre - half, centre + half, is_active)
     one, two = np.triu_indices(300, 1)
     overlap = np.all(np.abs(centre[one] - centre[two]) <= half[one] + half[two], axis=1)
     wanted = overlap & (is_active[one] | is_active[two])

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from rigid_scenes import ball, body, cube, in_room, in_space
+from rigid_scenes import advance, ball, body, cube, in_room, in_space
 from thread_counts import digest_of, result_on_any_threads
 
 from sim.build import build_world
@@ -146,6 +146,23 @@ def test_a_run_that_continues_among_sleepers_equals_the_uninterrupted_one_to_the
     assert not expected["rigid/is_asleep"].any()  # the ball has hit them
     for key, array in expected.items():
         np.testing.assert_array_equal(found[key], array, err_msg=key)
+
+
+def test_who_sleeps_while_something_is_led_far_away_rests_on_the_same_contacts_after_a_restart():
+    def resting() -> RigidSolver:
+        path = ({"time_s": 1.2, "position": (1.5, 1.5, 1.0)}, {"time_s": 2.2, "position": (-1.5, 1.5, 1.0)})
+        return stack(body("led", cube(0.1), kind="kinematic", keyframe=path))
+
+    straight, continued = run(resting(), 1.8), resting()
+    assert straight.bodies.is_asleep[:-1].all()
+    continued.restore(straight.checkpoint())
+    for solver in (straight, continued):
+        solver.set_gravity((0.0, 0.0, -10.0))
+        advance(solver, 0.02, 2e-3)
+    assert straight.diagnostics()["contacts"] > 0
+    expected, found = straight.checkpoint(), continued.checkpoint()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(array, found[name], err_msg=name)
 
 
 def digest_of_many() -> str:
