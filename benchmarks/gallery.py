@@ -27,12 +27,13 @@ JOBS = Path(__file__).resolve().parent.parent / "jobs"
 HEROES = {
     "ball_into_cloth": 34,
     "cloth_over_bunny": 22,
-    "dam_break": 36,
-    "drop_on_bunny_dfsph": 186,
-    "drop_on_bunny_wcsph": 186,
-    "duck_in_pool_pcisph": 51,
+    "dam_break": 33,
+    "drop_on_bunny_dfsph": 60,
+    "drop_on_bunny_wcsph": 60,
+    "duck_in_pool_pcisph": 36,
     "everything": 126,
     "smoke_moving_duck": 242,
+    "wine_glass": 100,
 }
 """The frame of a job to show large, or the drawn one next to it; of other jobs the one in the middle."""
 HERO_WIDTH, SHEET_WIDTH = 1280, 1200

@@ -112,7 +112,7 @@ def make_fluid(
     fluids: Sequence[Mapping[str, Any]] = ({},),
     **parameters: Any,
 ) -> SPHFluid:
-    """A fluid of given particles between the walls of a domain, at rest without velocities.
+    """A fluid of given particles between the walls of a domain, at rest without velocities; no tension unless given.
 
     `coupled` are further fields of `FluidStart`, `parameters` those of a material other than water, and `fluids` what
     each of several has of its own.
@@ -123,7 +123,13 @@ def make_fluid(
     from sim.fluid.tank import FluidStart
 
     block = {"shape": {"type": "box", "size": (1.0, 1.0, 1.0)}}
-    usual = {"name": "water", "solver": solver, "block": [block], "particle_radius": spacing / 2.0}
+    usual = {
+        "name": "water",
+        "solver": solver,
+        "block": [block],
+        "particle_radius": spacing / 2.0,
+        "surface_tension": 0.0,
+    }
     start = FluidStart(
         tuple(FluidParameters.model_validate({**usual, **parameters, **each}) for each in fluids),
         domain=domain,

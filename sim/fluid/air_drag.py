@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle
-from sim.core.drag import AIR_VISCOSITY, FLAT_DRAG, FLATTENING, TENSION_OF_WATER, drag_coefficient
+from sim.core.drag import AIR_VISCOSITY, FLAT_DRAG, FLATTENING, drag_coefficient
 from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Share
+from sim.core.water import TENSION_OF_WATER
 from sim.fluid.kernels import Discretization, inverse_distance, lattice_offsets
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid

@@ -15,12 +15,12 @@ from sim.core.motion.parameters import (
     require_ascending_times,
 )
 from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
+from sim.core.water import CAPILLARY_LENGTH, TENSION_OF_WATER
 from sim.fluid.inflow import Inflow
 from sim.fluid.traits import CFL_NUMBER, KEPT_OFF_SHEETS, TRAITS, VISCOUS_NUMBER
 from sim.shapes.parameters import Placement, Shape
 
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
-
 
 _DYE = "Concentration of dye, from 0 to 1 [-], which has the colour dye_color of the fluid's material,"
 
@@ -200,7 +200,9 @@ class FluidParameters(Parameters):
     surface_tension_model: Literal["becker_teschner2007", "csf"] = Field(
         default="becker_teschner2007",
         description="becker_teschner2007: cohesion of particles, without a unit of the surface; csf: a continuum "
-        "surface force (Brackbill et al. 1992), by the curvature of the surface and its contact angle with walls.",
+        "surface force (Brackbill et al. 1992), by the curvature of the surface and its contact angle with walls. "
+        f"With neither this nor a strength given, csf with that of water where the lattice spacing is at most "
+        f"{1e3 * CAPILLARY_LENGTH:.2g} mm, its capillary length, and the support two spacings.",
     )
     surface_tension: NonNegative = Field(
         default=0.0,
@@ -254,6 +256,20 @@ class FluidParameters(Parameters):
         if isinstance(data, dict) and "adhesion" in data:
             raise ValueError('adhesion is now contact_angle_deg, with surface_tension_model = "csf": 90 for none')
         return data
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_tension_where_it_is_seen(cls, data: Any) -> Any:
+        """At the scale of a glass, surface tension unless the job says otherwise."""
+        if not isinstance(data, dict) or not {"surface_tension_model", "surface_tension"}.isdisjoint(data):
+            return data
+        radius, support = (
+            data.get(key, cls.model_fields[key].default) for key in ("particle_radius", "support_in_spacings")
+        )
+        # What is no number is refused later, by its own key.
+        if not isinstance(radius, int | float) or 2.0 * radius > CAPILLARY_LENGTH or support != 2.0:
+            return data
+        return {**data, "surface_tension_model": "csf", "surface_tension": TENSION_OF_WATER}
 
     @property
     def spacing(self) -> float:

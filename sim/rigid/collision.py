@@ -89,7 +89,8 @@ class CollisionDetector:
         return {
             "near_pairs": self._pairs.copy(),
             "near_budgets": self._budgets(),
-            "near_boxes": np.zeros_like(self._outer) if self._must_search else self._outer.copy(),
+            # Boxes that are to be searched anew lie in none.
+            "near_boxes": np.full_like(self._outer, kernels.FAR) if self._must_search else self._outer.copy(),
             "near_motion": self._moved.copy(),
             "contact_starts": starts,
             **{
@@ -208,15 +209,6 @@ class CollisionDetector:
     def follow(self, motion: Array) -> None:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
         self._moved = self._moved + motion
-
-    def near(self) -> tuple[Indices, Indices]:
-        """The pairs of bodies that were near in the last step, (p,) each; the domain is one."""
-        if not len(self._pairs):
-            nothing = np.zeros(0, dtype=np.int64)
-            return nothing, nothing
-        is_near = viewed(self._near.action)[: len(self._pairs)] != kernels.DROPPED
-        first, second = self._pairs[is_near, :2].astype(np.int64).T
-        return first, second
 
     def overlapping(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> tuple[Indices, Indices]:
         """Pairs of bodies whose boxes overlap with what surfaces may reach, and that may touch, (p,) each.

@@ -321,7 +321,9 @@ class RigidSolver:
         rests = awake & (bodies.rest_s >= SLEEP_TIME_S)
         if not rests.any() or not self.gravity.any():
             return
-        first, second = (np.minimum(numbers, n) for numbers in self._detector.near())
+        # Those that would wake each other rest together.
+        meetings = self._chooser.meetings(self.poses(), dt, ~bodies.is_asleep)
+        first, second = (np.minimum(numbers, n) for numbers in (meetings.first, meetings.second))
         free, leads = np.append(awake, False), np.append(~bodies.is_dynamic & (speeds > 0.0), False)
         first, second = (np.concatenate(each) for each in zip((first, second), self._chooser.links, strict=True))
         links = free[first] & free[second]

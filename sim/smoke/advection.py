@@ -1,6 +1,6 @@
-"""Carry fields along the flow: semi-Lagrangian (Stam 1999), or MacCormack with clamping (Selle et al. 2008).
+"""Carry velocity along the flow: semi-Lagrangian (Stam 1999), or MacCormack with clamping (Selle et al. 2008).
 
-Positions are counted in cells in the index space of the field that is looked up, so a face value is traced from its
+Positions are counted in cells in the index space of the faces that are looked up, so a face value is traced from its
 own face and no offset of half a cell can creep in. The trace is one straight step with the velocity at its end, which
 is first-order in time by itself; MacCormack's second pass corrects the error of the trace as well as of the look-up.
 """
@@ -13,12 +13,11 @@ from sim.core.arrays import Floats
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
-from sim.smoke.arrays import Faces, State
-from sim.smoke.balance import restore_total
+from sim.smoke.arrays import Faces
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.lanes import Grid, cell_counts, fill_row, fill_row_pair, lane_items, lane_place, row_start
+from sim.smoke.lanes import Grid, cell_counts, fill_row, lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air
-from sim.smoke.reductions import Rows
+from sim.smoke.transport import Transport
 
 FAR = 1.0e9  # beyond every box [cells]
 
@@ -35,12 +34,9 @@ class Outside(NamedTuple):
 class Advection:
     """Advects cell and face values of one grid.
 
-    What is carried in through an open side is clean air at the air's temperature (0 in every cell array). It has the
-    velocity of the air outside along the side; across it that on the side itself, which the pressure gives it. Beyond
-    walls everything has the value of the nearest place inside.
-
-    With MacCormack the semi-Lagrangian result is corrected; with rows to reduce for `restore_total`, the totals of
-    density and heat are kept in spite of the limiter.
+    Cells: `Transport`. Faces: what is carried in through an open side has along it the velocity of the air outside;
+    across it that on the side itself, which the pressure gives it. Beyond walls everything has the value of the nearest
+    place inside.
     """
 
     def __init__(
@@ -51,12 +47,11 @@ class Advection:
         *,
         maccormack: bool,
         wind: Vector3 = (0.0, 0.0, 0.0),
-        balance: tuple[Rows, Rows] | None = None,
     ) -> None:
         """Take the air of a grid, six arrays to work in, and the velocity of the air outside [m/s]."""
         self._air, self._cells_per_metre = air, 1.0 / grid.cell_size
         self._predicted, self._corrected = Faces(*work[:3]), Faces(*work[3:])
-        self._maccormack, self._balance = maccormack, balance
+        self._maccormack, self._cells = maccormack, Transport(air, work, sharpens=maccormack)
         low = (1.0 if grid.lets_in(axis, 0) else -FAR for axis in range(3))
         high = (float(n) if grid.lets_in(axis, 1) else FAR for axis, n in enumerate(grid.cells))
         self._outside = Outside(ti.math.vec3(*low), ti.math.vec3(*high), ti.math.vec3(wind))
@@ -66,34 +61,13 @@ class Advection:
         step = dt * self._cells_per_metre
         box, outside, state = self._air.box, self._outside, self._air.state
         predicted, corrected = self._predicted, self._corrected
-        _predict_cells(box, outside, state, predicted, step)
-        if self._maccormack:
-            _correct_cells(box, outside, state, predicted, corrected, step)
-            if self._balance is not None:
-                restore_total(self._air, state.density, predicted.x, corrected.x, *self._balance, step)
-                restore_total(self._air, state.excess, predicted.y, corrected.y, *self._balance, step)
-        result = corrected if self._maccormack else predicted
-        _store_cells(box, state, result)
+        self._cells.advance(step)
         for axis in range(3):
             _predict_faces(axis, box, outside, state.velocity, predicted[axis], step)
         if self._maccormack:
             for axis in range(3):
                 _correct_faces(axis, box, outside, state.velocity, predicted[axis], corrected[axis], step)
-        _store_faces(box, state.velocity, result)
-
-
-@kernel
-def _predict_cells(box: Grid, outside: Outside, state: State, predicted: Faces, step: ti.f32):
-    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
-        given = ti.static((i, j, box, outside, state, step))
-        fill_row_pair(box, (predicted.x, predicted.y), row_start(box, i, j), box.nz, lane, _predicted_cell, given)
-
-
-@kernel
-def _correct_cells(box: Grid, outside: Outside, state: State, predicted: Faces, corrected: Faces, step: ti.f32):
-    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
-        given = ti.static((i, j, box, outside, state, predicted, step))
-        fill_row_pair(box, (corrected.x, corrected.y), row_start(box, i, j), box.nz, lane, _corrected_cell, given)
+        _store_faces(box, state.velocity, corrected if self._maccormack else predicted)
 
 
 @kernel
@@ -121,15 +95,6 @@ def _correct_faces(
 
 
 @kernel
-def _store_cells(box: Grid, state: State, result: Faces):
-    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
-        for n in range(lane_items(box, box.nz, lane)):
-            at = row_start(box, i, j) + lane_place(box, n, lane)
-            state.density[at] = result.x[at]
-            state.excess[at] = result.y[at]
-
-
-@kernel
 def _store_faces(box: Grid, velocity: Faces, result: Faces):
     """Copy the faces; beyond the last cells, only those across the axis exist."""
     for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
@@ -142,39 +107,6 @@ def _store_faces(box: Grid, velocity: Faces, result: Faces):
                 velocity.y[at] = result.y[at]
             if i <= box.nx and j <= box.ny:
                 velocity.z[at] = result.z[at]
-
-
-@func
-def _predicted_cell(k: ti.i32, i: ti.i32, j: ti.i32, box: Grid, outside: Outside, state: State, step: ti.f32):
-    at = row_start(box, i, j) + k
-    departure = ti.Vector([float(i), float(j), float(k)]) - step * _velocity_at_cell(box, state.velocity, at)
-    there, offset = _locate(box, departure, 3)
-    kept = _kept(outside, departure, 3)
-    density = kept * _interpolate(box, state.density, there, offset)
-    return density, kept * _interpolate(box, state.excess, there, offset)
-
-
-@func
-def _corrected_cell(
-    k: ti.i32, i: ti.i32, j: ti.i32, box: Grid, outside: Outside, state: State, predicted: Faces, step: ti.f32
-):
-    """phi = phi^ + (phi_n - phi_) / 2, where phi_ is phi^ carried back (Selle et al. 2008, eq. 5)."""
-    at = row_start(box, i, j) + k
-    here = ti.Vector([float(i), float(j), float(k)])
-    shift = step * _velocity_at_cell(box, state.velocity, at)
-    there, offset = _locate(box, here + shift, 3)
-    density = predicted.x[at]
-    excess = predicted.y[at]
-    density += 0.5 * (state.density[at] - _interpolate(box, predicted.x, there, offset))
-    excess += 0.5 * (state.excess[at] - _interpolate(box, predicted.y, there, offset))
-    origin, _ = _locate(box, here - shift, 3)
-    density = _clamp_to_corners(box, density, state.density, origin)
-    excess = _clamp_to_corners(box, excess, state.excess, origin)
-    # Outside air has no past to compare with: there the first-order value stands. Selected, not branched over, so
-    # that the loop can be vectorized.
-    has_past = _has_past(outside, here, shift, 3)
-    density = ti.select(has_past, density, predicted.x[at])
-    return density, ti.select(has_past, excess, predicted.y[at])
 
 
 @func

@@ -11,7 +11,7 @@ threads read neighbouring places. One form of loop serves both, as a CPU has one
 The first loop must be the outermost of its kernel.
 
 Loops that store are not vectorized in that form: to the compiler each value that is stored may be the address of an
-array, which it then loads anew for the next cell. Where a row has one lane, `fill_row` and `fill_row_pair` therefore
+array, which it then loads anew for the next cell. Where a row has one lane, `fill_row` and `fill_rows` therefore
 compute a *run* of cells, keep the results in a local array, which is no address, and store them when all are there.
 """
 
@@ -119,26 +119,30 @@ def fill_row(
 
 
 @func
-def fill_row_pair(
+def fill_rows(
     box: Grid,
-    pair: ti.template(),
+    outs: ti.template(),
     row: ti.i32,
     length: ti.i32,
     lane: ti.i32,
     compute: ti.template(),
     given: ti.template(),
 ):
-    """As `fill_row`, of two values at a time, for a pair of arrays."""
-    first_out, second_out = ti.static(pair[0], pair[1])
+    """As `fill_row`, of some values at a time, which go to an array each."""
+    count = ti.static(len(outs))
     if ti.static(box.lanes == 1):
         for run in range(length // RUN):
             first = run * RUN + 1
-            values, others = new_run(), new_run()
+            values = [new_run() for _ in range(count)]
             for m in range(RUN):
-                values[m], others[m] = compute(first + m, *given)
-            for m in range(RUN):
-                first_out[row + first + m] = values[m]
-                second_out[row + first + m] = others[m]
+                found = compute(first + m, *given)
+                for c in ti.static(range(count)):
+                    values[c][m] = found[c]
+            for c in ti.static(range(count)):
+                for m in range(RUN):
+                    outs[c][row + first + m] = values[c][m]
     for n in range(rest_items(box, length, lane)):
         k = rest_place(box, length, n, lane)
-        first_out[row + k], second_out[row + k] = compute(k, *given)
+        found = compute(k, *given)
+        for c in ti.static(range(count)):
+            outs[c][row + k] = found[c]

@@ -163,7 +163,8 @@ class SmokeParameters(Parameters):
     turbulence: TurbulenceParameters = Field(default=TurbulenceParameters(), description="Gusts in the air.")
     advection: Literal["maccormack", "semi_lagrangian"] = Field(
         default="maccormack",
-        description="maccormack: second order, clamped (Selle et al. 2008); or semi_lagrangian.",
+        description="maccormack: velocity to second order, clamped (Selle et al. 2008), smoke and heat by limited "
+        "fluxes (Zalesak 1979); or semi_lagrangian, with smoke and heat by donor cells: both of first order.",
     )
     projection_tolerance: Positive = Field(
         default=1.0e-5, description="Largest divergence after the projection: max|div u| dx / max|u| [-]."

@@ -38,16 +38,15 @@ class SmokeSolver:
     One substep, by operator splitting as in Stam 1999: advect, let obstacles move on, accelerate, emit, project, cool.
     Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
 
-    Exact: smoke is added by sources only, and what they add is counted. Approximate: MacCormack advection keeps the
-    total of smoke and of heat (`restore_total`), but at moving solids to first order only, and semi-Lagrangian
-    advection does not, so `mass` is a measured quantity. Heat lets air rise by the strength of gravity, unless the
-    parameters say how fast, and does not expand it.
+    Exact, but for rounding: smoke is added by sources and leaves through open sides only, what sources add is counted,
+    and heat is kept likewise (`Transport`). At moving solids that holds to first order, so `mass` is a measured
+    quantity. Heat lets air rise by the strength of gravity, unless the parameters say how fast, and does not expand it.
 
     Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`sim.smoke.sides`).
 
     Solids that move drive air by the velocity of their surface (`Obstacles`), and take whole cells from time to time:
     in between, air flows through the sides of their cells at the speed of the solid. So the smoke of a cell that they
-    cover is dropped, as look-ups across the moving side have brought in as much ahead of it, and a cell that they
+    cover is dropped, as much has come through the moving side ahead of it, and a cell that they
     leave has the smoke that was continued into it, as much as flowed in behind them. Both are counted.
 
     In a closed region sources drive air, but do not add any; nor do bodies that are wholly inside. What a piston
@@ -97,7 +96,6 @@ class SmokeSolver:
             work,
             maccormack=parameters.advection == "maccormack",
             wind=parameters.wind,
-            balance=(new_rows(self.air.box), new_rows(self.air.box)),
         )
         self._open_sides = self.grid.open_sides
         self._gravity, self._has_gravity = gravity, any(upward(gravity))

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import gammainc, gammaincinv
 
-from sim.core.drag import TENSION_OF_WATER
 from sim.core.hashed_numbers import uniforms
+from sim.core.water import TENSION_OF_WATER
 from sim.whitewater.kinds import (
     GAMMA_ORDER,
     LARGEST_SHARE,

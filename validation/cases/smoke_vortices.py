@@ -37,11 +37,11 @@ SPAN, SHOWN = 0.01, 0.5  # how long it is spun up to measure the rate, a radian 
 EXPECTED = {
     "maccormack": (
         "MacCormack",
-        (2.0, 0.5, "second, but for the crest that the limiter cuts"),
+        (2.5, 0.5, "third but for the crest that the limiter cuts, and second across axes"),
         (2.0, 0.25, "extrapolated from two steps at each grid"),
     ),
     "semi_lagrangian": (
-        "linear look-ups",
+        "donor cells and linear look-ups",
         (0.75, 0.35, "first, where the blob is wide against what it is smeared by"),
         (1.0, 0.25, "likewise; their diffusion is |u| h a second, and stays"),
     ),

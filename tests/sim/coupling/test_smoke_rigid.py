@@ -291,7 +291,7 @@ def test_a_ball_that_flies_through_a_layer_of_smoke_keeps_its_mass():
     for _ in range(34):
         numbers = world.advance_frame().diagnostics["air"]
     # It has bored a hole of its own diameter, whose smoke would be 6 % of the layer. Dropping what it covers makes up
-    # for what look-ups across its moving side have brought in: measured, 2.2 % of the mass are missing in the end.
+    # for what has come through its moving side: measured, 0.7 % of the mass are too much in the end.
     bored = np.pi * 0.14**2 * 0.2
-    assert numbers["covered_mass"] - numbers["uncovered_mass"] > 0.8 * bored
-    assert numbers["mass"] == pytest.approx(before, rel=0.03)
+    assert numbers["covered_mass"] > bored
+    assert numbers["mass"] == pytest.approx(before, rel=0.01)

@@ -8,7 +8,8 @@ from pydantic import ValidationError
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.core.domain import DomainParameters
-from sim.core.drag import AIR_VISCOSITY, TENSION_OF_WATER
+from sim.core.drag import AIR_VISCOSITY
+from sim.core.water import TENSION_OF_WATER
 from sim.fluid.parameters import FluidParameters, shared_conflicts
 
 SPACE = DomainParameters(min=(-0.2,) * 3, max=(0.2,) * 3, open_faces=EVERY_FACE)

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import brentq, curve_fit
+from scipy.signal import find_peaks
 from scipy.spatial import ConvexHull
 from small_fluids import EVERY_FACE, lattice, make_fluid, run, steps
 from thread_counts import digest_of, result_on_any_threads
@@ -196,6 +198,49 @@ def test_threads_grow_fastest_at_the_wavelength_of_rayleigh_and_plateau(taichi_c
     assert max(rates) == pytest.approx(0.34, rel=0.25)
 
 
+@pytest.mark.slow
+def test_a_jet_beads_at_the_wavelength_of_rayleigh_and_plateau(taichi_cpu):
+    """Distances of what swells on a jet that nothing but its particles disturbs, until it breaks into pieces."""
+    radius, spacing = 0.001, 0.001 / 3
+    tap = {"shape": {"type": "disc", "radius": radius}, "direction": (1.0, 0.0, 0.0), "speed": 0.8}
+    tap |= {"position": (0.0, 0.0, 0.0)}
+    space = DomainParameters(
+        min=(-2 * radius, *(-6 * radius,) * 2), max=(120 * radius, *(6 * radius,) * 2), open_faces=EVERY_FACE
+    )
+    # No model, no strength: at this scale water has its tension.
+    fluid = make_fluid(
+        space,
+        np.empty((0, 3), np.float32),
+        gravity=(0.0,) * 3,
+        capacity=20_000,
+        solver="dfsph",
+        particle_radius=spacing / 2,
+        emitter=(tap,),
+    )
+    distances, whole = [], []
+    run(fluid, 0.12)
+    for _ in range(32):
+        run(fluid, 0.005)
+        x = position(fluid)[:, 0] / radius
+        swellings, end = along_the_jet(x, spacing / radius)
+        distances.extend(np.diff(swellings))
+        whole.append(end)
+    assert min(whole) < 60.0 < x.max()  # it breaks
+    assert len(distances) > 40  # where one is missed two distances are one: their median stays
+    # Rayleigh 1878: 9.02 radii.
+    assert np.median(distances) == pytest.approx(9.02, rel=0.15)
+
+
+def along_the_jet(x: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
+    """Where a jet is thicker than around, by a fifth of its section, and where it ends or is torn first; in radii."""
+    edges = np.arange(0.0, 120.0, 0.1)
+    section = gaussian_filter1d(np.histogram(x, edges)[0] * spacing**3 / (math.pi * 0.1), 6.0)
+    torn = edges[:-1][(section < 0.25) & (edges[:-1] > 5.0)]
+    end = min(torn[0], x.max() - 12.0)  # without its tip
+    swellings = edges[find_peaks(section, prominence=0.2)[0]]
+    return swellings[(swellings > 3.0) & (swellings < end)], float(end)
+
+
 def drop_on_a_plate(solver: str) -> str:
     """Digest of all that a drop on a plate is after some steps."""
     plate = DomainParameters(min=(-0.01, -0.01, 0.0), max=(0.01,) * 3, open_faces=("x-", "x+", "y-", "y+", "z+"))
@@ -266,6 +311,21 @@ def test_fluids_have_a_surface_each(taichi_cpu):
     assert np.abs(one[inside]).max() < 0.02 * np.abs(one).max()
     assert two["b"][inside[upper == 1], 2].mean() > 10.0 * abs(one[inside & (upper == 1), 2].mean())
     np.testing.assert_allclose(two["a"][:, 2].sum(), -two["b"][:, 2].sum(), rtol=1e-3)
+
+
+def test_at_the_scale_of_a_glass_water_has_its_tension_unless_the_job_says_otherwise():
+    def model_and_strength(**keys):
+        block = [{"shape": {"type": "sphere", "radius": 1}}]
+        fluid = FluidParameters.model_validate({"name": "water", "block": block, **keys})
+        return fluid.surface_tension_model, fluid.surface_tension
+
+    none = ("becker_teschner2007", 0.0)
+    assert model_and_strength(particle_radius=0.00135) == ("csf", 0.0728)
+    assert model_and_strength(particle_radius=0.00135, contact_angle_deg=60.0) == ("csf", 0.0728)
+    assert model_and_strength(particle_radius=0.00136) == none
+    assert model_and_strength(particle_radius=0.001, surface_tension=0.0) == none
+    assert model_and_strength(particle_radius=0.001, support_in_spacings=3.0) == none
+    assert model_and_strength(particle_radius=0.001, surface_tension_model="csf", surface_tension=0.05)[1] == 0.05
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,18 @@ def test_a_wall_of_bricks_stands_and_does_not_tremble():
     assert speeds[-1] == 0.0
 
 
+def test_a_wall_in_colours_stands_as_well(monkeypatch):
+    """As GPUs solve contacts."""
+    monkeypatch.setattr("sim.rigid.contact_response.runs_on_gpu", lambda: True)
+    solver = brick_wall(3, 4)
+    start = solver.bodies.position.copy()
+    speeds = run(solver, SLEEP_TIME_S + 0.1)
+    assert max(speeds) < 1e-3
+    assert np.linalg.norm(solver.bodies.position - start, axis=1).max() < 1e-4
+    assert solver.bodies.is_asleep.all()
+    assert solver.diagnostics()["not_converged"] == 0.0
+
+
 def test_a_high_wall_of_bricks_does_not_tremble_either():
     """Of 199, whose solves end before they have converged: what is left must not add up, nor contacts take turns."""
     solver = brick_wall(10, 19)
@@ -86,7 +98,7 @@ def test_a_high_wall_of_bricks_does_not_tremble_either():
 
 
 def pyramid(layers: int) -> RigidSolver:
-    """Boxes in square layers, a millimetre apart, and a heavy ball that flies into their middle."""
+    """Boxes in square layers, a millimetre apart, and a heavy block that flies into their upper half."""
     edge, pitch = 0.1, 0.101
     boxes = [
         body(
@@ -100,7 +112,8 @@ def pyramid(layers: int) -> RigidSolver:
         for column in range(size)
     ]
     away = 0.5 * pitch * layers
-    hit = body("hit", ball(0.15), (-away - 0.5, 0.0, 0.2 * layers * edge + 0.15), velocity=(6.0, 0, 0), density=3000.0)
+    place = (-away - 0.3, 0.0, 0.5 * layers * edge + 0.15)
+    hit = body("hit", cube(0.25), place, velocity=(6.0, 0, 0), density=3000.0, friction=0.5)
     hall = DomainParameters(min=(-4.0 * away, -3.0 * away, 0.0), max=(5.0 * away, 3.0 * away, 4.0))
     return in_room(*boxes, hit, domain=hall)
 
@@ -108,14 +121,14 @@ def pyramid(layers: int) -> RigidSolver:
 def test_a_pyramid_falls_when_it_is_hit_and_comes_to_rest():
     solver = pyramid(4)
     start = solver.bodies.position.copy()
-    run(solver, 0.05)
+    run(solver, 0.03)
     boxes = slice(0, -1)
     assert np.linalg.norm(solver.bodies.position - start, axis=1)[boxes].max() < 1e-4  # it stands until then
     run(solver, 3.0)
     moved = np.linalg.norm(solver.bodies.position - start, axis=1)[boxes]
-    assert np.count_nonzero(moved > 0.05) >= len(moved) // 2
+    assert np.count_nonzero(moved > 0.2) >= 5  # those of the upper two layers
     assert start[boxes, 2].mean() - solver.bodies.position[boxes, 2].mean() > 0.02
-    assert solver.bodies.is_asleep[boxes].all()
+    assert solver.bodies.is_asleep.all()
     solver.bodies.wake(np.ones(len(start), dtype=bool))
     run(solver, 0.05)
     assert solver.diagnostics()["max_penetration"] < 1e-4  # a thousandth of an edge

@@ -75,7 +75,8 @@ def test_air_comes_in_without_a_velocity_along_the_side():
     inner = grid.trim(after["u_face_x"], grid.face_shape(0))
     assert inner[..., -1] == pytest.approx(np.full_like(inner[..., -1], (1.0 - step) * along), rel=1.0e-5)
     assert inner[..., :-1] == pytest.approx(np.full_like(inner[..., :-1], along), rel=1.0e-5)
-    density = grid.trim(after["density"], grid.cells)
+    # Nor is there smoke behind the walls, which air passes here.
+    density = grid.trim(after["density"], grid.cells)[3:-3]
     assert density[..., -1] == pytest.approx(np.full_like(density[..., -1], 1.0 - step), rel=1.0e-5)
 
 
