@@ -103,11 +103,6 @@ class PartsDetector:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
         self._inner.follow(motion[self._of_part])
 
-    def near(self) -> tuple[Indices, Indices]:
-        """The pairs of bodies that were near in the last step, (p,) each; the domain is one."""
-        first, second = self._inner.near()
-        return self._of_part[first], self._of_part[second]
-
     def overlapping(self, poses: Poses, motion: Array, is_active: NDArray[np.bool_]) -> tuple[Indices, Indices]:
         """Pairs of bodies of which parts have boxes that overlap with what surfaces may reach, (p,) each."""
         among = is_active[self._of_part[:-1]]
