@@ -185,7 +185,8 @@ class Watch:
             self.seen.append(f"{event}{arguments[:1]!r:.200}")
         elif event in CHANGES or (event == "open" and _writes(arguments[1], arguments[2])):
             path = str(arguments[0])
-            if "__pycache__" not in path and not path.isdigit() and not path.startswith("/dev/null"):
+            is_bytecode = "__pycache__" in path or ".pyc" in path  # the latter in a folder of its own
+            if not is_bytecode and not path.isdigit() and not path.startswith("/dev/null"):
                 self.seen.append(f"{event}{arguments[:3]!r:.200}")
 
 
