@@ -29,7 +29,15 @@ def find(solver: Advection, cells: Sequence[int]) -> Found:
     ends = [fronts[n][-1] for n in cells]
     rise = (ends[-2] - HEIGHT) / (ends[-1] - HEIGHT)
     reason = "measured, from the middle of the source; at this order the finest is off by about half as much"
-    checks = [Check("rise of the front at half the resolution, over that at the finest", rise, 1.0, 0.03 * 64 / cells[-1], reason)]
+    checks = [
+        Check(
+            "rise of the front at half the resolution, over that at the finest",
+            rise,
+            1.0,
+            0.03 * 64 / cells[-1],
+            reason,
+        )
+    ]
     if len(cells) > 2:
         reason = "steps are refined with cells: first order in time, second to third in space, which prevails so far"
         checks.append(Check("order of the front's height", order_of_differences(*ends), 2.5, 0.5, reason))
