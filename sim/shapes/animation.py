@@ -9,9 +9,10 @@ import tempfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
+from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
 from sim.core.motion import rotation
@@ -140,8 +141,11 @@ def _kept_arrays(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]] | None:
     """Times, points and triangles that were read before; None where there are none, or no whole ones."""
     try:
-        with np.load(kept) as arrays:
-            return arrays["times"], arrays["points"], arrays["triangles"]
+        with ZipFile(kept) as archive:
+            times, points, triangles = (
+                read_array(archive.open(f"{name}.npy"), allow_pickle=False) for name in ("times", "points", "triangles")
+            )
+            return times, points, triangles
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
 
