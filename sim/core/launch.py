@@ -263,7 +263,6 @@ class FastKernel:
         """Note how each argument that is used is passed, and at which place among those that are no templates."""
         self._templates: list[int] = []
         self._arrays: list[tuple[int, tuple[int]]] = []
-        self._host_types: dict[tuple[int], tuple[np.dtype[Any], int, int]] = {}  # numpy's, its axes, those of elements
         self._floats: list[tuple[int, tuple[int]]] = []
         self._integers: list[tuple[int, tuple[int]]] = []
         self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
@@ -290,9 +289,6 @@ class FastKernel:
     def _sort_argument(self, index: int, place: int, annotation: Any) -> None:
         if isinstance(annotation, NdarrayType):
             self._arrays.append((index, (place,)))
-            of_elements = annotation.dtype.ndim if isinstance(annotation.dtype, MatrixType) else 0
-            kind = annotation.dtype.dtype if of_elements else annotation.dtype
-            self._host_types[place,] = np.dtype(to_numpy_type(kind)), annotation.ndim + of_elements, of_elements
         elif isinstance(annotation, VectorType):
             vectors = self._float_vectors if annotation.dtype in primitive_types.real_types else self._integer_vectors
             vectors.append((index, [(place, axis) for axis in range(annotation.n)]))
@@ -383,6 +379,17 @@ class HostArraysKernel(FastKernel):
         self._pass_numbers(context, used, [None] * len(used))
         program.launch_kernel(executable, context)
         return functools.partial(self._result, program, None, context, 0)
+
+    def _sort_arguments(self) -> None:
+        self._host_types: dict[tuple[int], tuple[np.dtype[Any], int, int]] = {}  # numpy's, its axes, those of elements
+        super()._sort_arguments()
+
+    def _sort_argument(self, index: int, place: int, annotation: Any) -> None:
+        super()._sort_argument(index, place, annotation)
+        if isinstance(annotation, NdarrayType):
+            of_elements = annotation.dtype.ndim if isinstance(annotation.dtype, MatrixType) else 0
+            kind = annotation.dtype.dtype if of_elements else annotation.dtype
+            self._host_types[place,] = np.dtype(to_numpy_type(kind)), annotation.ndim + of_elements, of_elements
 
     def _key(self, used: Sequence[Any]) -> tuple[Any, ...]:
         """Compile-time values alone: these kernels name the types of all arrays."""
