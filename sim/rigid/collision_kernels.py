@@ -9,18 +9,14 @@ from typing import NamedTuple
 
 import taichi as ti
 
+from sim.core.arrays import Floats
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel, kernel_of_host_arrays
 from sim.core.scan import scan_in_parallel
+from sim.rigid.array_types import Numbers, Rows, Vector3, Whole, WholeRows
 from sim.rigid.contact_kernels import tangents_of
 from sim.rigid.contacts import FEATURE_BITS, KEPT_BONUS, MOST_PATCHES, SAME_PATCH, WALL_BITS
 
-Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
-Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
-Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
-WholeRows = ti.types.ndarray(dtype=ti.i32, ndim=2)
-Distances = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Vector3 = ti.types.vector(3, ti.f64)
 Vector8 = ti.types.vector(8, ti.f64)
 Index8 = ti.types.vector(8, ti.i32)
 
@@ -50,7 +46,7 @@ class Shapes(NamedTuple):
     sizes: Rows  # other numbers, likewise, (s, 19)
     balls: Rows  # centre, radius, axis, cone of the balls of all shapes, (m, 8)
     clusters: Rows  # centre and radius of each `BALLS_PER_CLUSTER` of them, (c, 4)
-    values: Distances  # distances at the nodes of all grids [m]
+    values: Floats  # distances at the nodes of all grids [m]
     edges: Rows  # start and extent of the edges of all profiles, (e, 4)
 
 
@@ -609,6 +605,17 @@ def count_contacts(count: ti.i32, bodies: Bodies, near: Near, found: Found, befo
     return scan_in_parallel(near.numbers, count, near.sums, kept.starts)
 
 
+@ti.func
+def copy_contact(row: ti.i32, kept: ti.template(), source: ti.i32, known: ti.template()):
+    """What a contact is, from a row of `Found` or `Kept`."""
+    for column in ti.static(range(2)):
+        kept.features[row, column] = known.features[source, column]
+    for column in ti.static(range(6)):
+        kept.planes[row, column] = known.planes[source, column]
+    for column in ti.static(range(4)):
+        kept.balls[row, column] = known.balls[source, column]
+
+
 @kernel
 def place_contacts(
     count: ti.i32, bodies: Bodies, near: Near, found: Found, before: Kept, kept: Kept, placed: Placed
@@ -627,24 +634,14 @@ def place_contacts(
             if is_examined:
                 source = near.place[pair] * MOST_KEPT + number
                 known = is_known(pair, found.features[source, 0], found.features[source, 1], near, before)
-                for column in ti.static(range(2)):
-                    kept.features[row, column] = found.features[source, column]
-                for column in ti.static(range(6)):
-                    kept.planes[row, column] = found.planes[source, column]
-                for column in ti.static(range(4)):
-                    kept.balls[row, column] = found.balls[source, column]
+                copy_contact(row, kept, source, found)
                 for column in ti.static(range(3)):
                     kept.forces[row, column] = 0.0
                     if known >= 0:
                         kept.forces[row, column] = before.forces[known, column]
             else:
                 source = before.starts[old] + number
-                for column in ti.static(range(2)):
-                    kept.features[row, column] = before.features[source, column]
-                for column in ti.static(range(6)):
-                    kept.planes[row, column] = before.planes[source, column]
-                for column in ti.static(range(4)):
-                    kept.balls[row, column] = before.balls[source, column]
+                copy_contact(row, kept, source, before)
                 for column in ti.static(range(3)):
                     kept.forces[row, column] = before.forces[source, column]
             side = kept.features[row, 0]

@@ -100,7 +100,7 @@ class CollisionShapes:
             if geometry.deformation is not None
         ]
         self._tables, self._time_s = tables, -np.inf
-        self.most_balls = max(1, int(whole[:, kernels.BALLS].max()))
+        self.most_balls = int(whole[:, kernels.BALLS].max())
         if self.most_balls > 1 << (FEATURE_BITS - WALL_BITS):
             raise ShapeError(f"a shape of {self.most_balls:,} balls is too large for contacts; make it less slender")
         self._is_polytope = np.array([each is not None for each in found])

@@ -6,14 +6,9 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
-from sim.rigid.joint_kernels import JointRows, Velocities, relax_joints
+from sim.rigid.array_types import Eases, Numbers, Rows, Vector3, Velocities, Whole, WholeRows
+from sim.rigid.joint_kernels import JointRows, relax_joints
 from sim.rigid.joint_system import UNBOUNDED
-
-Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
-Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
-Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
-Pairs = ti.types.ndarray(dtype=ti.i32, ndim=2)
-Vector3 = ti.types.vector(3, ti.f64)
 
 MAX_FRICTION_STEPS = 12
 FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
@@ -24,7 +19,6 @@ LEAST, LOWEST, FRICTION, IMPULSE, CHANGE, AHEAD = 21, 22, 23, 24, 27, 30
 """Columns of what a contact is while its island is solved: arms are two, tangents of three numbers too."""
 COLUMNS = 33
 Work = ti.types.ndarray(dtype=ti.types.vector(COLUMNS, ti.f64), ndim=1)
-Eases = ti.types.ndarray(dtype=ti.types.vector(7, ti.f64), ndim=1)
 Ahead = ti.types.ndarray(dtype=ti.types.vector(12, ti.f64), ndim=1)
 
 
@@ -32,7 +26,7 @@ Ahead = ti.types.ndarray(dtype=ti.types.vector(12, ti.f64), ndim=1)
 class System(NamedTuple):
     """Contacts, (c,), of bodies, (n,), and what is asked of them."""
 
-    bodies: Pairs  # the two bodies of each, (c, 2)
+    bodies: WholeRows  # the two bodies of each, (c, 2)
     point: Rows  # [m], (c, 3)
     normal: Rows  # from the second to the first, (c, 3)
     least: Numbers  # bounds of the normal velocities from below [m/s]
@@ -74,7 +68,7 @@ class Outcomes(NamedTuple):
     velocity: Velocities  # of bodies without impulses, and with them [m/s], [rad/s], (n,)
     along_normal: Numbers  # relative velocities [m/s], (c,)
     extra: Velocities  # that only moves bodies apart [m/s], [rad/s], (n,)
-    sweeps: Pairs  # that each island took in both solves, one more than the most where it was given up, (i, 2)
+    sweeps: WholeRows  # that each island took in both solves, one more than the most where it was given up, (i, 2)
     work: Work  # what contacts are, (c,)
     ahead: Ahead  # of bodies: velocities before a sweep, and directions of what goes on, (n,)
 
@@ -211,13 +205,15 @@ def friction_impulse(a_11: ti.f64, a_12: ti.f64, a_22: ti.f64, c_1: ti.f64, c_2:
 
 
 @func
-def push(body: ti.i32, impulse: Vector3, at: ti.i32, arm: ti.i32, system: System, found: Outcomes):
-    """Give a body of a contact an impulse; its arm begins at some column."""
-    if system.ease[body][0] > 0.0:
-        turn = tensor_times(system.ease[body], vector_of(found.work, at, arm).cross(impulse))
-        for axis in ti.static(range(3)):
-            found.velocity[body][axis] += system.ease[body][0] * impulse[axis]
-            found.velocity[body][3 + axis] += turn[axis]
+def push_both(one: ti.i32, two: ti.i32, impulse: Vector3, at: ti.i32, ease: Eases, velocity: Velocities, work: Work):
+    """Give the two bodies of a contact an impulse, and its opposite."""
+    for side in ti.static(range(2)):
+        body, own = (one, impulse) if ti.static(side == 0) else (two, -impulse)
+        if ease[body][0] > 0.0:
+            turn = tensor_times(ease[body], vector_of(work, at, ARM + 3 * side).cross(own))
+            for axis in ti.static(range(3)):
+                velocity[body][axis] += ease[body][0] * own[axis]
+                velocity[body][3 + axis] += turn[axis]
 
 
 @func
@@ -441,10 +437,8 @@ def solve_island(
     may_change = tolerance + relative_tolerance * may_change
     for at in range(begin, end):
         contact = islands.order[at]
-        impulse = along_axes(at, IMPULSE, found.work)
-        for side in ti.static(range(2)):
-            body = system.bodies[contact, side]
-            push(body, ti.select(side == 0, impulse, -impulse), at, ARM + 3 * side, system, found)
+        one, two = system.bodies[contact, 0], system.bodies[contact, 1]
+        push_both(one, two, along_axes(at, IMPULSE, found.work), at, system.ease, found.velocity, found.work)
     taken = relax_contacts(
         True, has_joints, island, may_change, islands, system, joint_order, joint_first, joints,
         found.velocity, found.ahead, found.work,
@@ -549,7 +543,7 @@ def join(one: ti.i32, two: ti.i32, group: Whole):
 
 
 @kernel_of_host_arrays
-def join_bodies(bodies: Pairs, links: Pairs, moves: Whole, group: Whole):
+def join_bodies(bodies: WholeRows, links: WholeRows, moves: Whole, group: Whole):
     """Groups of bodies that contacts, (c, 2), and links, (l, 2), hang together by way of bodies that move.
 
     Args:

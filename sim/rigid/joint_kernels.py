@@ -6,12 +6,7 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
-
-Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
-Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
-Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
-Pairs = ti.types.ndarray(dtype=ti.i32, ndim=2)
-Velocities = ti.types.ndarray(dtype=ti.types.vector(6, ti.f64), ndim=1)
+from sim.rigid.array_types import Numbers, Rows, Velocities, Whole, WholeRows
 
 BODIES, MOVES, PARENT, COLUMN, FACTOR, STATE, PATTERN, FLAG, FILLED, NEXT, WHOLE_COLUMNS = (
     0, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12,
@@ -41,13 +36,13 @@ ROUNDING = 1.0e-10  # velocity [m/s], [rad/s] that counts as none where bounds a
 class JointRows(NamedTuple):
     """Rows of joints, (r,), in the order of their elimination, and A = J M⁻¹ Jᵀ of them, column by column."""
 
-    whole: Pairs  # (r + 1, WHOLE_COLUMNS)
+    whole: WholeRows  # (r + 1, WHOLE_COLUMNS)
     numbers: Rows  # (r, NUMBER_COLUMNS)
     entry_rows: Whole  # rows of the entries of A on and above the diagonal, (e,)
     entries: Numbers  # (e,)
     factor_rows: Whole  # of L without its diagonal, (f,)
     factor: Numbers  # (f,)
-    components: Pairs  # first row and end of the rows that joints link, and whether A is factored, (c, 3)
+    components: WholeRows  # first row and end of the rows that joints link, and whether A is factored, (c, 3)
 
 
 @func

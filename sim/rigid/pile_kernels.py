@@ -10,10 +10,10 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
+from sim.rigid.array_types import Eases, LongRows, Numbers, Velocities, Whole, WholeRows
 from sim.rigid.collision_kernels import Bodies, Kept, Near, Placed
 from sim.rigid.contact_kernels import (
     AHEAD,
-    ARM,
     CHANGE,
     COLUMNS,
     IMPULSE,
@@ -21,27 +21,17 @@ from sim.rigid.contact_kernels import (
     NORMAL,
     OWN,
     Ahead,
-    Eases,
     Work,
     along_axes,
     gather_contact,
     join,
+    push_both,
     relax_pair,
     row_of,
-    tensor_times,
     vector_of,
     velocity_at,
     wanted_apart,
 )
-from sim.rigid.joint_kernels import Velocities
-
-Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
-Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
-Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
-LongWhole = ti.types.ndarray(dtype=ti.i64, ndim=1)
-LongRows = ti.types.ndarray(dtype=ti.i64, ndim=2)
-WholeRows = ti.types.ndarray(dtype=ti.i32, ndim=2)
-Vector3 = ti.types.vector(3, ti.f64)
 
 MOST_COLOURS = 30  # besides a last one, whose pairs may have bodies in common and are solved one after the other
 COLOURS = MOST_COLOURS + 1
@@ -266,15 +256,7 @@ def start_pair(item: ti.i32, near: Near, kept: Kept, pile: Pile):
     pair = pile.pairs[item]
     one, two, _ = moving(near, kept, pile, pair)
     for at in range(kept.starts[pair], kept.starts[pair + 1]):
-        impulse = along_axes(at, IMPULSE, pile.work)
-        for side in ti.static(range(2)):
-            body = one if ti.static(side == 0) else two
-            if pile.ease[body][0] > 0.0:
-                own = impulse if ti.static(side == 0) else -impulse
-                turn = tensor_times(pile.ease[body], vector_of(pile.work, at, ARM + 3 * side).cross(own))
-                for axis in ti.static(range(3)):
-                    pile.velocity[body][axis] += pile.ease[body][0] * own[axis]
-                    pile.velocity[body][3 + axis] += turn[axis]
+        push_both(one, two, along_axes(at, IMPULSE, pile.work), at, pile.ease, pile.velocity, pile.work)
 
 
 @func

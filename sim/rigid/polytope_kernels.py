@@ -11,6 +11,7 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
+from sim.rigid.array_types import Numbers, Rows, Vector3, Whole, WholeRows
 from sim.rigid.collision_kernels import (
     FAR,
     MOST_KEPT,
@@ -18,11 +19,6 @@ from sim.rigid.collision_kernels import (
     Found,
     Kept,
     Near,
-    Numbers,
-    Rows,
-    Vector3,
-    Whole,
-    WholeRows,
     add_candidate,
     beside_wall,
     keep_few,

@@ -6,16 +6,11 @@ import taichi as ti
 
 from sim.core.bundles import bundle
 from sim.core.launch import kernel_of_host_arrays
-from sim.rigid.joint_kernels import Velocities
+from sim.rigid.array_types import Eases, Numbers, Rows, Vector3, Velocities, Whole
 
-Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
-Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
-Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
-Vector3 = ti.types.vector(3, ti.f64)
 Vector4 = ti.types.vector(4, ti.f64)
 Matrix3 = ti.types.matrix(3, 3, ti.f64)
 Matrices = ti.types.ndarray(dtype=Matrix3, ndim=1)
-Eases = ti.types.ndarray(dtype=ti.types.vector(7, ti.f64), ndim=1)
 
 SEQUENCE = ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
 """Principal axes and shares of the step; the same forwards and backwards, hence second order and reversible."""

@@ -165,13 +165,6 @@ class MovingBodies:
         self.velocity = np.where(which[:, None], 0.0, self.velocity)
         self.angular_velocity = np.where(which[:, None], 0.0, self.angular_velocity)
 
-    def set_angular_momentum(self, momentum: Array, which: NDArray[np.bool_]) -> None:
-        """Set the angular velocity of bodies, (n,), to that of a spin in world axes [kg m²/s], (n, 3)."""
-        turned = self.rotation()
-        in_body = np.einsum("nji,nj->ni", turned, momentum)
-        angular_velocity = np.einsum("nij,nj->ni", turned, np.einsum("njk,nk->nj", self._inverse_tensor, in_body))
-        self.angular_velocity = np.where(which[:, None], angular_velocity, self.angular_velocity)
-
     def apply_impulses(self, linear: Array, angular: Array) -> None:
         """Change the velocities of the dynamic bodies by linear [N s] and angular impulses [N m s], (n, 3) each."""
         if not self.is_dynamic.any():

@@ -6,12 +6,7 @@ import taichi as ti
 
 from sim.core.bundles import bundle
 from sim.core.launch import kernel_of_host_arrays
-
-Numbers = ti.types.ndarray(dtype=ti.f64, ndim=1)
-Rows = ti.types.ndarray(dtype=ti.f64, ndim=2)
-Whole = ti.types.ndarray(dtype=ti.i32, ndim=1)
-WholeRows = ti.types.ndarray(dtype=ti.i32, ndim=2)
-Vector3 = ti.types.vector(3, ti.f64)
+from sim.rigid.array_types import Numbers, Rows, Vector3, Whole, WholeRows
 
 
 @bundle

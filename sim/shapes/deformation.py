@@ -160,10 +160,6 @@ class Deformation:
             return 0.0
         return float(self._speeds[int(np.searchsorted(self._times, time_s, side="right")) - 1])
 
-    def moves_within(self, time_s: float, dt: float) -> bool:
-        """Whether it deforms somewhere in dt [s] from a time [s] on."""
-        return bool(time_s + dt > self._times[0] and time_s < self._times[-1])
-
     @cached_property
     def widest(self) -> int:
         """Number of the sample in which its surface is largest: points spread there are nowhere too far apart."""
