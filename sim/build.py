@@ -30,6 +30,7 @@ from sim.fluid.opening_conflicts import opening_problem
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart
+from sim.forces.field import ForceField
 from sim.rigid.joint_parameters import joint_problems
 from sim.rigid.solver import SOLVER_NAME as RIGID_NAME
 from sim.rigid.solver import RigidSolver
@@ -60,20 +61,25 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         ValueError: a body cannot start as described.
     """
     _refuse_names(scene)
+    forces = ForceField(scene.force) if scene.force else None
     shapes = SharedShapes()
     static = [StaticBody(parameters, shapes) for parameters in scene.rigid if parameters.kind == "static"]
-    rigid = _build_rigid(scene)
+    rigid = _build_rigid(scene, forces)
     cloths = []
     if scene.cloth:  # one solver for all, as they collide with each other
         solver = ClothSolver(
-            scene.cloth, domain=scene.domain, gravity=scene.gravity, frames_per_second=frames_per_second
+            scene.cloth,
+            domain=scene.domain,
+            gravity=scene.gravity,
+            frames_per_second=frames_per_second,
+            forces=forces,
         )
         cloths = [solver]
     samples = None
     if cloths and scene.fluid:
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
-    fluids = [_build_fluids(scene, static, rigid, samples)] if scene.fluid else []
-    smokes = [_build_smoke(smoke, scene, static) for smoke in scene.smoke]
+    fluids = [_build_fluids(scene, static, rigid, samples, forces)] if scene.fluid else []
+    smokes = [_build_smoke(smoke, scene, static, forces) for smoke in scene.smoke]
     coupled: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
@@ -83,7 +89,13 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
     standing = {body.name: body.snapshot() for body in static}
-    return World([*coupled, *solvers], frames_per_second=frames_per_second, couplings=couplings, standing=standing)
+    return World(
+        [*coupled, *solvers],
+        frames_per_second=frames_per_second,
+        couplings=couplings,
+        standing=standing,
+        at_moment=forces and forces.at,
+    )
 
 
 def _refuse_names(scene: SceneParameters) -> None:
@@ -98,7 +110,11 @@ def _refuse_names(scene: SceneParameters) -> None:
 
 
 def _build_fluids(
-    scene: SceneParameters, static: Sequence[StaticBody], rigid: RigidSolver | None, cloth: ClothSamples | None
+    scene: SceneParameters,
+    static: Sequence[StaticBody],
+    rigid: RigidSolver | None,
+    cloth: ClothSamples | None,
+    forces: ForceField | None,
 ) -> SPHFluid:
     """One solver for all fluids, as they share the tank; of what moves it has the samples."""
     if conflicts := shared_conflicts(scene.fluid):
@@ -145,6 +161,7 @@ def _build_fluids(
         followed=followed,
         carriers=carriers,
         capacity=particle_capacity(fluids, scene.domain, filling, volume),
+        forces=forces,
     )
     return SOLVERS[scene.fluid[0].solver](start)
 
@@ -172,7 +189,7 @@ def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: f
     return samples[inside.all(axis=1)]
 
 
-def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
+def _build_rigid(scene: SceneParameters, forces: ForceField | None) -> RigidSolver | None:
     """The solver of the bodies that move, if there are any."""
     problems = [
         f'joint "{scene.joint[each.number].name}": {each.text}'
@@ -184,21 +201,33 @@ def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
     if not moving:
         return None
     obstacles = [body for body in scene.rigid if body.kind == "static"]
-    solver = RigidSolver(moving, obstacles=obstacles, joints=scene.joint, domain=scene.domain, gravity=scene.gravity)
+    solver = RigidSolver(
+        moving,
+        obstacles=obstacles,
+        joints=scene.joint,
+        domain=scene.domain,
+        gravity=scene.gravity,
+        forces=forces,
+    )
     solver.has_own_steps = not scene.fluid and not scene.cloth
     check_start(solver)
     return solver
 
 
-def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, static: Sequence[StaticBody]) -> SmokeSolver:
+def _build_smoke(
+    smoke: SmokeParameters, scene: SceneParameters, static: Sequence[StaticBody], forces: ForceField | None
+) -> SmokeSolver:
     """The solver of one smoke, with static bodies in it, and room for what will move in it."""
-    return SmokeSolver(
+    solver = SmokeSolver(
         with_sources_on(smoke, scene.rigid),
         domain=scene.domain,
         gravity=scene.gravity,
         solids=[body.solid for body in static],
         moving=_meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
     )
+    if forces is not None:
+        solver.feel(forces)
+    return solver
 
 
 def _meets_fluid(smoke: SmokeParameters, scene: SceneParameters) -> bool:

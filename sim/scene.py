@@ -10,6 +10,7 @@ from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
 from sim.fluid.parameters import FluidParameters, dye_conflict
+from sim.forces.parameters import MOST_FORCES, Force, unknown_targets
 from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.parameters import RigidBodyParameters
@@ -31,6 +32,9 @@ class SceneParameters(Parameters):
     smoke: tuple[SmokeParameters, ...] = Field(default=(), description="Smoke.")
     cloth: tuple[ClothParameters, ...] = Field(
         default=(), description="Cloths; they collide with each other, and share the keys that say how they step."
+    )
+    force: Annotated[tuple[Force, ...], Field(max_length=MOST_FORCES)] = Field(
+        default=(), description="Forces from outside, and moving air, that act on all bodies, or on some."
     )
     device: Device = Field(
         default="auto", description="Where the simulation runs; auto: the fastest device that works."
@@ -57,6 +61,21 @@ class SceneParameters(Parameters):
                     ("rigid", body.table, "breaks"),
                     f"is of a body in a job with {other}, which pushes pieces one by one; remove one of both",
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _has_forces_on_bodies(self) -> Self:
+        names = [body.name for body in (*self.fluid, *self.smoke, *self.cloth, *self.rigid)]
+        names += [body.group for body in self.rigid]
+        for number, entry, name in unknown_targets(self.force, names):
+            raise KeyRefusedError(
+                ("force", number, "only", entry), f'"{name}" is the name of no body, group, fluid, cloth or smoke'
+            )
+        broken = [body for body in self.rigid if body.whole is not None]
+        if self.force and broken:
+            raise KeyRefusedError(
+                ("rigid", broken[0].table, "breaks"), "is of a body in a job with forces; remove one of both"
+            )
         return self
 
     @model_validator(mode="after")

@@ -9,10 +9,11 @@ from sim.cloth.bundles import Air, Nodes
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
-from sim.core.arrays import Vectors, on_device
+from sim.core.arrays import Integers, Vectors, on_device
 from sim.core.bundles import with_room
 from sim.core.launch import kernel
 from sim.core.parameters import KeyRefusedError, Vector3
+from sim.forces.field import ForcesOn, ForceTable, air_at, change_of_velocity
 
 WIND = -1  # source of air that is nothing but the wind of a cloth's parameters
 
@@ -79,6 +80,11 @@ class ClothAir:
         self.velocity.from_numpy(np.where(is_wind[:, None], wind_of, self.velocity.to_numpy()))
         self.acts = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
 
+    def blow(self, forces: ForcesOn) -> None:
+        """Let winds move the air that no coupling puts there, on top of the wind of the parameters."""
+        state = self._state
+        blow_at_triangles(self._on_device, self.wind, self.source, state.position, state.body, forces.now)
+
     def predict(self, gravity: Vector3, dt: float) -> None:
         """Accelerate the nodes by gravity and the air in a step of dt [s], note where that leads, and the impulse."""
         state = self._state
@@ -112,6 +118,25 @@ def drag_along(
     if air_mobility > 0.0:
         force = ti.min(force, ti.max(left.dot(direction), 0.0) / (dt * (mobility + air_mobility)))
     return force
+
+
+@kernel
+def blow_at_triangles(air: Air, wind: Vectors, source: Integers, position: Vectors, body: Integers, forces: ForceTable):
+    """Air of triangles that no coupling gives theirs: the wind of their cloth, and the winds at their centres."""
+    for t in range(source.shape[0]):
+        if source[t] == WIND:
+            a, b, c = air.triangles[t][0], air.triangles[t][1], air.triangles[t][2]
+            centre = (position[a] + position[b] + position[c]) / 3.0
+            air.velocity[t] = wind[t] + air_at(forces, body[a], centre).xyz
+
+
+@kernel
+def push_nodes(nodes: Nodes, position: Vectors, body: Integers, forces: ForceTable, dt: ti.f32):
+    """Change velocities of nodes that nothing holds by forces from outside."""
+    for i in range(position.shape[0]):
+        if nodes.inverse_mass[i] > 0.0:
+            v_i = nodes.velocity[i]
+            nodes.velocity[i] = v_i + change_of_velocity(forces, body[i], position[i], v_i, dt)
 
 
 @kernel

@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.air import ClothAir
+from sim.cloth.air import ClothAir, push_nodes
 from sim.cloth.cells import cells_of
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.device_cells import DeviceCells
@@ -34,6 +34,7 @@ from sim.core.host_access import add, copied, viewed
 from sim.core.parameters import Vector3
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
+from sim.forces.field import ForceField
 
 SOLVER_NAME = "cloth"
 
@@ -71,6 +72,7 @@ class ClothSolver:
         domain: cloth may come ten of its diagonals away from it.
         gravity: [m/s²].
         frames_per_second: substeps are counted per frame [1/s].
+        forces: from outside; none if omitted.
 
     Raises:
         ShapeError: a mesh cannot be read, or is no sheet.
@@ -85,6 +87,7 @@ class ClothSolver:
         domain: DomainParameters,
         gravity: Vector3,
         frames_per_second: float,
+        forces: ForceField | None = None,
     ) -> None:
         self.name = SOLVER_NAME
         self.parameters = tuple(parameters)
@@ -115,6 +118,7 @@ class ClothSolver:
         self._totals = ClothTotals(self.state, self._springs, self._cells)
         self._frame_dt = 1.0 / frames_per_second
         self.air = ClothAir(self.state)
+        self._forces = (forces or ForceField(())).on([(name,) for name in self.state.names])
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
         self._time_s = 0.0
@@ -220,6 +224,10 @@ class ClothSolver:
         self._hold_pins()
         if self.load is not None:
             self.load.put_on(self.state, self.gravity, dt)
+        if self._forces.accelerates:
+            push_nodes(self.state.nodes, self.state.position, self.state.body, self._forces.now, dt)
+        if self._forces.blows and self.air.acts:
+            self.air.blow(self._forces)
         self._integrator.accelerate(dt)
         self.air.predict(self.gravity, dt)
         self._pins.displace(self._time_s, dt)

@@ -47,6 +47,10 @@ class World:
             What it raises leaves the frame half done: only `restore` goes on from there.
         before_substep: called with a solver's name and the length [s] of its substep right before that, as an external
             force is; may be None.
+
+    Args:
+        at_moment: called with the simulated time [s] at which each substep starts, right before it: what acts in all
+            solvers alike goes to that moment.
     """
 
     def __init__(
@@ -56,11 +60,13 @@ class World:
         frames_per_second: float,
         couplings: Sequence[Coupling] = (),
         standing: Mapping[str, Snapshot] | None = None,
+        at_moment: Callable[[float], None] | None = None,
     ) -> None:
         self.frame = 0
         self.max_substeps_per_frame = MAX_SUBSTEPS_PER_FRAME
         self.watch: Callable[[], str | None] | None = None
         self.before_substep: Callable[[str, float], None] | None = None
+        self._at_moment = at_moment
         self._frames_per_second = frames_per_second
         self._solvers = {solver.name: solver for solver in solvers}
         self._couplings = tuple(couplings)
@@ -147,6 +153,8 @@ class World:
             dt = remaining / left
             if team.ahead is not None:
                 self._advance_team(team.ahead, dt, elapsed_s)
+            if self._at_moment is not None:
+                self._at_moment(self.time_s + elapsed_s)
             team.substep(dt, self.before_substep)
             remaining = remaining - dt if left > 1 else 0.0
             if (finding := self.watch and self.watch()) is not None:

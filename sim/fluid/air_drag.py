@@ -17,6 +17,7 @@ from sim.core.water import TENSION_OF_WATER
 from sim.fluid.kernels import Discretization, inverse_distance, lattice_offsets
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid
+from sim.forces.field import ForceTable, air_at
 
 SHEET_DRAG = 1.0  # C_D of a particle of a sheet [-]
 FULL_SHARE = 2.0 / 3.0  # of a full neighbourhood, from which on a particle is part of a sheet and no drop
@@ -79,10 +80,13 @@ class AirDrag:
         """Forget the impulse on the air so far."""
         self._reduction.partial.fill(0.0)
 
-    def add_acceleration(self, fluid: Fluid, acceleration: ti.Ndarray, dt: float) -> None:
-        """Add the drag to all other accelerations [m/s²] of a step of dt [s], and count what the air gets."""
+    def add_acceleration(self, fluid: Fluid, winds: ForceTable, acceleration: ti.Ndarray, dt: float) -> None:
+        """Add the drag to all other accelerations [m/s²] of a step of dt [s], and count what the air gets.
+
+        Winds move the air on top of its own velocity.
+        """
         share = self._reduction.over(fluid.particles.count)
-        add_air_drag(fluid, self._air, dt, acceleration, share)
+        add_air_drag(fluid, self._air, winds, dt, acceleration, share)
 
     @property
     def impulse(self) -> NDArray[np.float64]:
@@ -93,7 +97,7 @@ class AirDrag:
 
 
 @kernel
-def add_air_drag(fluid: Fluid, air: Air, dt: ti.f32, acceleration: Vectors, share: Share):
+def add_air_drag(fluid: Fluid, air: Air, winds: ForceTable, dt: ti.f32, acceleration: Vectors, share: Share):
     """The drag as `AirDrag` has it; each lane adds the impulse of its particles to what it had."""
     particles, near, samples = ti.static((fluid.particles, fluid.near, fluid.samples))
     lanes = share.tree.lanes
@@ -103,7 +107,7 @@ def add_air_drag(fluid: Fluid, air: Air, dt: ti.f32, acceleration: Vectors, shar
             i = lane * share.lane_step + item * share.item_step
             if i < particles.count:
                 x_i, own = particles.position[i], particles.phase[i]
-                wind = air.velocity - particles.velocity[i]
+                wind = air.velocity + air_at(winds, own, x_i).xyz - particles.velocity[i]
                 speed = wind.norm()
                 downwind = wind / ti.max(speed, 1.0e-12)
                 found = 0.0

@@ -22,15 +22,19 @@ def expected_speed(
     *,
     cohesion_stress: float = 0.0,
     body_speed: float = 0.0,
+    outer_acceleration: float = 0.0,
 ) -> float:
     """Largest speed to expect [m/s], never 0.
 
     That is the initial one with a fall from the highest particle to the bottom, the corner of the domain that lies
     deepest along gravity; what cohesion asks for, whose stress over the density is `cohesion_stress` [m²/s²]; or that
-    of the fastest body, `body_speed` [m/s], which fluid that it hits takes on.
+    of the fastest body, `body_speed` [m/s], which fluid that it hits takes on. Forces from outside, of at most
+    `outer_acceleration` [m/s²], act along the domain's diagonal on top.
     """
     initial = float((np.asarray(velocities, dtype=np.float64) ** 2).sum(axis=1).max(initial=0.0))
-    fall = math.sqrt(initial + square_of_fall_speed(positions, domain, gravity))
+    diagonal = math.dist(domain.min, domain.max)
+    by_forces = 2.0 * outer_acceleration * diagonal
+    fall = math.sqrt(initial + square_of_fall_speed(positions, domain, gravity) + by_forces)
     cohesion = math.sqrt(COHESION_SPEED_FACTOR * cohesion_stress)
     return max(fall, cohesion, body_speed, SLOWEST_EXPECTED_SPEED)
 

@@ -15,7 +15,7 @@ from sim.fluid.air_drag import AirDrag
 from sim.fluid.body_forces import Exerted
 from sim.fluid.body_friction import BodyFriction
 from sim.fluid.kernels import inverse_distance, spline_slope
-from sim.fluid.particles import Fluid, Phases
+from sim.fluid.particles import Fluid, Particles, Phases
 from sim.fluid.sheets import DENSITY
 from sim.fluid.surface_tension import Cohesion, SurfaceTensionCSF, cohesion_becker_teschner2007
 from sim.fluid.tank import ParticleTank
@@ -29,6 +29,7 @@ from sim.fluid.viscosity import (
     pair_viscosity,
     viscous_factor,
 )
+from sim.forces.field import ForceTable, change_of_velocity
 
 
 @bundle
@@ -124,12 +125,14 @@ class Forces:
         tank, pressure, cohesion = self._tank, elastic or self._no_pressure, self._cohesion.is_becker_teschner2007
         spacing = tank.discretization.spacing
         compute_acceleration(self._fluid, pressure, self._viscosity, tank.gravity, spacing, cohesion, self.acceleration)
+        if tank.outer_forces.accelerates:
+            add_outer_forces(tank.particles.arrays, tank.outer_forces.now, dt, self.acceleration)
         if self.csf is not None:
             self.csf.add_acceleration(tank.on_device, self.acceleration)
             fill = partial(self.csf.fill_forces, tank.on_device)
             tank.body_forces.gather_others(fill, tank.boundary.samples, dt)
         if self.air is not None:
-            self.air.add_acceleration(tank.on_device, self.acceleration, dt)
+            self.air.add_acceleration(tank.on_device, tank.outer_forces.now, self.acceleration, dt)
         self._begin_reaction(None if elastic is None else elastic.pressure_term, dt)
         self.add_implicit_viscosity(dt)
 
@@ -281,3 +284,11 @@ def compute_acceleration(
         if ti.static(with_cohesion):
             a_i -= materials.surface_tension[own] * fluid.sigma * cohesion_sum
         acceleration[i] = a_i
+
+
+@kernel
+def add_outer_forces(particles: Particles, forces: ForceTable, dt: ti.f32, acceleration: Vectors):
+    """Add the accelerations of forces from outside, and the means of their drag in dt [s]."""
+    for i in range(particles.count):
+        x_i, v_i = particles.position[i], particles.velocity[i]
+        acceleration[i] += change_of_velocity(forces, particles.phase[i], x_i, v_i, dt) / dt

@@ -19,6 +19,7 @@ from sim.fluid.kernels import Discretization
 from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
 from sim.fluid.sheets import SheetForces
 from sim.fluid.stepping import MotionSummary, ParticleStepper, box_of
+from sim.forces.field import ForceField
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -56,6 +57,7 @@ class FluidStart:
     followed: Mapping[str, Placement] = field(default_factory=dict)  # moving bodies that emitters follow, at the start
     carriers: Mapping[str, Carrier] = field(default_factory=dict)  # and which of the moving bodies they are
     capacity: int | None = None  # most particles that there can ever be; those at the start if omitted
+    forces: ForceField | None = None  # from outside; none if omitted
 
 
 class ParticleTank:
@@ -68,6 +70,7 @@ class ParticleTank:
         particles: with their neighbours.
         boundary: samples of walls, bodies and sheets.
         body_forces: what the fluid exerts on bodies and sheets.
+        outer_forces: those from outside on its fluids.
         emission: the emitters.
         motion: of the particles in the last step.
         last_speed: largest speed of a particle in the last step [m/s]; `motion` foresees the inflow as well.
@@ -95,6 +98,7 @@ class ParticleTank:
         _check_particles(start)
         self.gravity, self.discretization, self._materials = start.gravity, discretization, phases.materials
         self._looks_ahead = looks_ahead
+        self.outer_forces = (start.forces or ForceField(())).on([(fluid.name,) for fluid in start.fluids])
         self.removed = 0
         self._travelled = self._boundary_travelled = 0.0
         self.body_speed = self.sheet_speed = 0.0
@@ -149,7 +153,8 @@ class ParticleTank:
             }
         )
         self.last_speed = float(np.sqrt((np.asarray(start.velocities, np.float64) ** 2).sum(axis=1).max(initial=0.0)))
-        self.motion = MotionSummary(self.last_speed, float(np.linalg.norm(start.gravity)))
+        strongest = float(np.linalg.norm(start.gravity)) + self.outer_forces.largest_acceleration
+        self.motion = MotionSummary(self.last_speed, strongest)
         self.emission.carry(self._bodies)
         if pistons:
             self._place_bodies()

@@ -43,6 +43,11 @@ class RigidBodyParameters(WeightedPlacement):
         default=(0.0, 0.0, 0.0),
         description="Angular velocity about world axes [rad/s]: at the start (dynamic) or always (kinematic).",
     )
+    air_drag: NonNegative = Field(
+        default=1.0,
+        description="Coefficient by which the air of a [[force]], moving or still, presses on faces that it blows onto "
+        "[-]: the drag coefficient of a plate across it, twice that of a ball. Without such a force there is no air.",
+    )
     friction: NonNegative = Field(
         default=0.5, description="Coulomb friction [-]; a pair of bodies has the geometric mean of its two."
     )

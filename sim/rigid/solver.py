@@ -17,6 +17,8 @@ from sim.core.parameters import Vector3
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
+from sim.forces.field import ForceField
+from sim.rigid.air import OuterForces
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
 from sim.rigid.contact_solver import NOT_CARRIED, Carried
@@ -91,6 +93,7 @@ class RigidSolver:
         joints: Sequence[JointParameters] = (),
         domain: DomainParameters,
         gravity: Vector3,
+        forces: ForceField | None = None,
     ) -> None:
         self.name = SOLVER_NAME
         self.gravity = np.array(gravity, dtype=np.float64)  # its own, which contacts share
@@ -129,6 +132,7 @@ class RigidSolver:
         self.glue = Glue(parameters, self.solids, self.bodies) if has_pieces else None
         self._obey_links()
         self.has_own_steps = False
+        self._outer_forces = self._forces_on(parameters, forces)
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
         self._radius = np.array([geometry.radius for geometry in self.solids])
@@ -184,9 +188,18 @@ class RigidSolver:
         shortest = min(float(np.min(each, initial=np.inf)) for each in (meetings.time_s, meetings.alone_s))
         return min(dt, own_steps * shortest)
 
+    def _forces_on(self, parameters: Sequence[RigidBodyParameters], forces: ForceField | None) -> OuterForces | None:
+        """Forces from outside, if there are any that these bodies feel."""
+        if forces is None or not self.bodies.is_dynamic.any():
+            return None
+        on = forces.on([(body.name, body.group) for body in parameters])
+        return OuterForces(on, parameters, self.solids) if on.accelerates or on.blows else None
+
     def substep(self, dt: float) -> None:
         """Advance by dt [s]; groups of bodies that are too fast for it by several steps of their own."""
         bodies, start_s = self.bodies, self.time_s
+        if self._outer_forces is not None:
+            self._outer_forces.push(bodies, self.gravity, dt)
         if bodies.is_dynamic.any() and self.first_bad_quantity() is None:
             awake = self._awake(dt)
             for count, is_active in self._chooser.divided(self.poses(), dt, awake):

@@ -14,6 +14,7 @@ from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
+from sim.forces.field import ForceField
 from sim.shapes.solid import HasSignedDistance
 from sim.smoke.advection import Advection
 from sim.smoke.arrays import new_state
@@ -22,6 +23,7 @@ from sim.smoke.forces import accelerate, cool, upward
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air, AirForce, Obstacles, time_of_travel
+from sim.smoke.outer_forces import OuterForces
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection, ProjectionReport
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
@@ -122,6 +124,12 @@ class SmokeSolver:
         """The state by the names of a checkpoint."""
         names = ("u_face_x", "v_face_y", "w_face_z", "density", "excess_temperature")
         return dict(zip(names, (*self.state.velocity, self.state.density, self.state.excess), strict=True))
+
+    def feel(self, forces: ForceField) -> None:
+        """Let forces from outside act on the air from now on, as far as they are meant for it."""
+        own = forces.on([(self.name,)])
+        if own.accelerates or own.blows:
+            self.air_forces.append(OuterForces(own, self.air, self.parameters, self.grid))
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no air crosses more than `cfl` cells, and no obstacle more than one.
