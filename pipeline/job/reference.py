@@ -24,8 +24,9 @@ _KEYS_OF_TYPED = {
     "Opening": "[[fluid.emitter]] shape",
     "Sheet": "[[cloth]] shape",
     "Region": "[[cloth.pin]] region",
+    "Force": "[[force]]",
 }
-_FEW_TYPES = 3
+_MANY_TYPES = 6
 # Title of the table whose keys come from its material.
 _CLOTH = "ClothParameters"
 _SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
@@ -33,7 +34,8 @@ _SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "m
 
 def reference() -> str:
     """Markdown: a section with a table of keys for every table of the job file."""
-    return "\n".join(line for heading, about, node in _tables() for line in _section(heading, about, node))
+    tables = {heading: (about, node) for heading, about, node in _tables()}  # what several types have, once
+    return "\n".join(line for heading, table in tables.items() for line in _section(heading, *table))
 
 
 def with_reference(document: str) -> str:
@@ -54,11 +56,16 @@ def _tables() -> Iterator[tuple[str, str, schema.Node]]:
     for suffix, key in _KEYS_OF_TYPED.items():
         for name, definition in definitions.items():
             if name.endswith(suffix):
-                type_ = definition["properties"]["type"]["const"]
-                yield f'{key} = {{ type = "{type_}", ... }}', definition["description"], definition
+                type_ = f'type = "{definition["properties"]["type"]["const"]}"'
+                is_table = key.endswith("]]")
+                yield (
+                    f"{key} {type_}" if is_table else f"{key} = {{ {type_}, ... }}",
+                    definition["description"],
+                    definition,
+                )
                 for child, property_ in definition["properties"].items():
                     if child != "of":
-                        yield from _nested_tables(f"{key}.{child}", property_)
+                        yield from _nested_tables(f"{key.strip('[]') if is_table else key}.{child}", property_)
 
 
 def _nested_tables(path: str, property_: schema.Node) -> Iterator[tuple[str, str, schema.Node]]:
@@ -139,7 +146,7 @@ def _kind(node: schema.Node) -> str:
         return " or ".join(_kind(option) for option in options)
     if "oneOf" in node:
         types = sorted(node["discriminator"]["mapping"])
-        return f"{quoted_list(types)}, see below" if len(types) <= _FEW_TYPES else "a shape, see below"
+        return f"{quoted_list(types)}, see below" if len(types) <= _MANY_TYPES else "a shape, see below"
     if "enum" in node:
         return quoted_list(node["enum"])
     if "const" in node:

@@ -85,8 +85,9 @@ class SimulateStage(Stage):
         """What decides the frames; a live recording was made once, by hand, and nothing makes another one of it."""
         if job.recorded is not None:
             return ParameterSet.of(stage=self.name, version=0, tools={}, fps=job.fps, recorded=job.recorded)
-        # Jobs without joints keep the frames that they had before there were any.
-        scene = {name: getattr(job, name) for name in SceneParameters.model_fields if name != "joint" or job.joint}
+        # Jobs without joints or forces keep the frames that they had before there were any.
+        later = {name for name in ("joint", "force") if not getattr(job, name)}
+        scene = {name: getattr(job, name) for name in SceneParameters.model_fields if name not in later}
         bodies_by_content = {kind.name: [by_content(body) for body in kind.bodies(job)] for kind in KINDS.values()}
         tools = {name: tool_version(name) for name in ("taichi", "libigl", "numpy", "scipy", "trimesh")}
         return ParameterSet.of(

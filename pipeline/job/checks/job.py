@@ -10,6 +10,7 @@ from pipeline.job.checks.optical_depth import check_optical_depths
 from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_set
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.kinds.base import Kind
+from pipeline.kinds.checks.forces import check_forces
 from pipeline.kinds.checks.joints import check_joints
 from pipeline.kinds.checks.memory_budget import MemoryBudget, free_bytes, memory_budget
 from pipeline.kinds.checks.shapes import build_solids, in_scale
@@ -39,6 +40,7 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
     findings = Findings()
     _check_bodies(job, findings)
     check_joints(job, findings)
+    check_forces(job, findings)
     _check_whitewater(job, findings)
     _check_materials(job, findings)
     _check_dye(job, findings)

@@ -24,12 +24,12 @@ class KeyframeParameters(Parameters):
 
 
 class RampPointParameters(Parameters):
-    """How strong something that emits is at one time."""
+    """How strong something that emits, or a force, is at one time."""
 
     time_s: NonNegative = Field(description="Time [s]; later than that of the point before.")
     strength: Fraction = Field(
         description="Part of its full strength that it has then [-]: of density and heat of a source of smoke, of the "
-        "speed of an emitter."
+        "speed of an emitter, of the force."
     )
 
 

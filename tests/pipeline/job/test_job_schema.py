@@ -66,7 +66,7 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
     examples = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
-    example, many, hammer, vase, led, pouring, joints, cloth, smoke, limits = examples
+    example, many, hammer, vase, led, pouring, joints, forces, cloth, smoke, limits = examples
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")
@@ -93,6 +93,12 @@ def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     (tmp_path / "joined.toml").write_text(f'name = "joined"\n{joints}{"".join(bodies)}')
     loaded, findings = load_checked_job(tmp_path / "joined.toml")
     assert [joint.name for joint in loaded.job.joint] == ["axle", "tow"]
+    assert findings.warnings == []
+    plume = '[[smoke]]\nname = "smoke"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.1 }\n'
+    plume += "position = [0.0, 0.0, 0.3]\n"
+    (tmp_path / "windy.toml").write_text(f'name = "windy"\nduration = 4.0\n{forces}{bodies[0]}{plume}')
+    loaded, findings = load_checked_job(tmp_path / "windy.toml")
+    assert len(loaded.job.force) == 6
     assert findings.warnings == []
     (tmp_path / "flag.toml").write_text(f'name = "flag"\n{cloth}')
     assert len(load_job(tmp_path / "flag.toml").cloth[0].pin) == 2
