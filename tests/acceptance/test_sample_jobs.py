@@ -32,6 +32,7 @@ TINY = {
     "floating_bodies": {"fluid.water.particle_radius": 0.025},
     "hammock_of_water": {"cloth.sheet.shape.counts": [13, 13], "fluid.water.emitter.0.start_s": 0.0},
     "honey": {"fluid.honey.particle_radius": 0.0008},
+    "leaves_in_wind": {"rigid.maple.count": 4, "rigid.birch.count": 4, "rigid.oak.count": 4},
     "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},
     "smoke_in_box": {"smoke.plume.cell_size": 0.016},
     "smoke_moving_duck": {"smoke.fog.cell_size": 0.06},

@@ -32,8 +32,9 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
     """Warn of bodies that cloth may let through.
 
     A rod may be thin for a sheet that is pinned along it, and stays so: the sheet hangs from it, and does not have to
-    find it.
+    find it. Of a group the thinnest body is named.
     """
+    thin: dict[str, list[tuple[float, str, ClothStart]]] = {}
     for path, solid in solids.items():
         if path[0] != "rigid":
             continue
@@ -49,14 +50,18 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
                 too_coarse.append(start)
         if too_coarse:
             coarsest = max(too_coarse, key=lambda start: start.longest_edge)
-            findings.warn(
-                (*coarsest.path, "shape"),
-                f'"{body.name}" is {thickness:.3g} m across, less than two of the longest edges, '
-                f"{coarsest.longest_edge:.3g} m each: it may show or pass between the nodes; divide the sheet "
-                "more finely, or make the body larger",
-            )
+            thin.setdefault(body.group, []).append((thickness, body.name, coarsest))
         if problem := thin_wall_problem(solid, who="cloth", what="cloth"):
             findings.warn((*path[:2], "shape"), problem)
+    for bodies in thin.values():
+        thickness, name, coarsest = min(bodies, key=lambda each: each[0])
+        others = f", and {len(bodies) - 1} more of its group are thin" if len(bodies) > 1 else ""
+        findings.warn(
+            (*coarsest.path, "shape"),
+            f'"{name}" is {thickness:.3g} m across, less than two of the longest edges, '
+            f"{coarsest.longest_edge:.3g} m each{others}: it may show or pass between the nodes; divide the sheet "
+            "more finely, or make the body larger",
+        )
 
 
 @dataclass(frozen=True, eq=False)
