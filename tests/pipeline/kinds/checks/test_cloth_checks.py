@@ -239,7 +239,9 @@ def test_bodies_that_fit_between_the_nodes_are_told(tmp_path):
 
 def test_of_a_group_that_fits_between_the_nodes_the_thinnest_body_is_told(tmp_path):
     """Ninety leaves made ninety warnings."""
-    small = BALL.replace("radius = 0.1", "radius = 0.06") + "count = 5\nspacing = [0.13, 0.13, 0.13]\nscales = [0.5, 1.0]\n"
+    small = (
+        BALL.replace("radius = 0.1", "radius = 0.06") + "count = 5\nspacing = [0.13, 0.13, 0.13]\nscales = [0.5, 1.0]\n"
+    )
     (warning,) = [each for each in warnings(SHEET + small, tmp_path) if "longest edges" in each]
     assert "and 4 more of its group are thin" in warning
 
