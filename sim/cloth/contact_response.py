@@ -213,15 +213,15 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
     without the twelve atomic sums that each contact would otherwise take.
 
-    What stands and touches a vertex that nothing else touches is settled at once: its D is exact, so that one step
-    solves it, and no other contact hears of it. In draped cloth these are most of all that push.
+    What stands and touches a vertex that nothing else touches is settled in one step (`settle_all`): its D is exact,
+    and no other contact hears of it. In draped cloth these are most of all that push.
 
     If bodies may move, each vertex between what stands and a body that moves gets its `support`, and its contacts a
     normal along that, from `held_sums`, `lever` and `pressing_body`.
     """
     contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end, weighed_end = contacts.counter[3], vertex_count, whole_warps(contacts.counter[3])
+    contacts_end, vertices_end = contacts.counter[3], vertex_count
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
@@ -271,34 +271,18 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
                 of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
                 own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
                 nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
-    for first in range(weighed_end):
-        # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
-        if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
-            continue
-        given_body, given = -1, Given(0)
-        for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
-            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
-            if c < contacts_end and impulses.mobility[c] > 0.0:
-                if is_first == 1:
-                    impulses.impulse[c] = ti.math.vec3(0.0)
-                v = contacts.vertices[c][0]
-                if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
-                    impulses.mobility[c] = nodes.inverse_mass[v]
-                    push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
-                    if sums.counter[4] == 0:
-                        sums.counter[4] = 1
-                else:
-                    place = ti.atomic_add(sums.counter[0], 1)
-                    impulses.pushing[place] = c
-                    impulses.mobility[c] = weighed(c, place, r)
-            if ti.static(runs_on_gpu()):
-                give_body_together(push, body, arm, bodies.impulse, c)
-            elif body >= 0:
-                if body != given_body:
-                    give(given, given_body, bodies.impulse)
-                    given_body, given = body, Given(0)
-                given += opposite_of(push, arm)
-        give(given, given_body, bodies.impulse)
+    for c in range(contacts_end):
+        if impulses.mobility[c] > 0.0:
+            if is_first == 1:
+                impulses.impulse[c] = ti.math.vec3(0.0)
+            if is_settled(c, r):
+                impulses.mobility[c] = nodes.inverse_mass[contacts.vertices[c][0]]
+                if sums.counter[4] == 0:
+                    sums.counter[4] = 1
+            else:
+                place = ti.atomic_add(sums.counter[0], 1)
+                impulses.pushing[place] = c
+                impulses.mobility[c] = weighed(c, place, r)
 
 
 @func
@@ -327,6 +311,38 @@ def is_of_vertex_and_what_stands(c: ti.i32, contacts: Contacts, bodies: PushedBo
     """Whether a contact is one of a single vertex with a wall, or with a body that no push moves."""
     is_against = contacts.kind[c] >= 0 or contacts.kind[c] == WALL
     return is_against and body_mobility(c, contacts, bodies) == 0.0 and contacts.weights[c][0] == 1.0
+
+
+@func
+def is_settled(c: ti.i32, r: Response) -> ti.u1:
+    """Whether a contact that pushes is settled in one step."""
+    return r.nodes.uses[2 * r.contacts.vertices[c][0]] == ALONE and is_of_vertex_and_what_stands(
+        c, r.contacts, r.bodies
+    )
+
+
+@func
+def settle_all(count: ti.i32, r: Response):
+    """Settle those of so many contacts that one step solves."""
+    contacts, impulses, bodies = ti.static((r.contacts, r.impulses, r.bodies))
+    contacts_end, whole_end = count, whole_warps(count)
+    for first in range(whole_end):
+        # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
+        if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
+            continue
+        given_body, given = -1, Given(0)
+        for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
+            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
+            if c < contacts_end and impulses.mobility[c] > 0.0 and is_settled(c, r):
+                push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
+            if ti.static(runs_on_gpu()):
+                give_body_together(push, body, arm, bodies.impulse, c)
+            elif body >= 0:
+                if body != given_body:
+                    give(given, given_body, bodies.impulse)
+                    given_body, given = body, Given(0)
+                given += opposite_of(push, arm)
+        give(given, given_body, bodies.impulse)
 
 
 @func
@@ -472,16 +488,21 @@ TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they
 
 
 @large_kernel
-def push(momenta: Momenta, starts: ti.i32, finishes: ti.i32, r: Response, thickness: Floats) -> ti.math.ivec4:
-    """Some steps of the iteration of a round (`weigh_contacts`), and where they lead if it `finishes`.
+def push(
+    momenta: Momenta, starts: ti.i32, settles: ti.i32, finishes: ti.i32, r: Response, thickness: Floats
+) -> ti.math.ivec4:
+    """Some steps of the iteration of a round of contacts that were weighed (`weigh_contacts`), and where they lead if
+    it `finishes`; first those that one step solves, if it `settles` them.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
-    `TOLERANCE` then, and whether any were settled.
+    `TOLERANCE` then, and whether any are settled.
     """
     contacts, sums = ti.static((r.contacts, r.sums))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
-    measured_end = finishes * pushing_count
+    measured_end, settled_end = finishes * pushing_count, settles * sums.counter[4] * contacts.counter[3]
+    sums.counter[3] = 0
+    settle_all(settled_end, r)
     push_apart(momenta, starts, pushing_count, touched_count, r)
     finish_push(finishes, pushing_count, touched_count, r)
     for place in range(measured_end):

@@ -261,15 +261,14 @@ class ContinuousContacts:
         begun: tuple[Callable[[], list[int]], Callable[[], bool]] | None,
     ) -> None:
         """Push in turns with the springs, for as long as these `relax`; the first round may have begun."""
-        is_first = True
         while True:
-            pushed, go_on = begun or (self._begin_push(state, is_first=is_first), relax())
+            pushed, go_on = begun or (self._begin_push(state, is_first=True), relax())
             found = pushed()
             pushing, _, _, settled = found
             if not (pushing or settled) or not go_on():
                 break
             self._iterations += STEPS if pushing else settled
-            is_first, begun = False, None
+            begun = self._push_on(state, 0, settles=True, finishes=True), relax()
         self._push_further(state, found)
 
     def _push_further(self, state: ClothState, found: Sequence[int]) -> None:
@@ -278,18 +277,18 @@ class ContinuousContacts:
         self._iterations += STEPS if pushing else settled
         if pushing and is_missing:
             for step in range(0, MORE_ITERATIONS, STEPS):
-                self._push_on(state, step, finishes=step + STEPS >= MORE_ITERATIONS)
+                self._push_on(state, step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
             self._iterations += MORE_ITERATIONS
 
     def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
         """A round of the first `STEPS` steps; asks for what `push` returns."""
         weigh_contacts(self._response, state.vertex_count, int(is_first))
-        return self._push_on(state, 0, finishes=True)
+        return self._push_on(state, 0, settles=True, finishes=True)
 
-    def _push_on(self, state: ClothState, first: int, *, finishes: bool) -> Callable[[], list[int]]:
+    def _push_on(self, state: ClothState, first: int, *, settles: bool, finishes: bool) -> Callable[[], list[int]]:
         """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
         momenta = _momenta_from(first)
-        return push.later(momenta, int(first == 0), int(finishes), self._response, state.thickness)
+        return push.later(momenta, int(first == 0), int(settles), int(finishes), self._response, state.thickness)
 
     @property
     def _response(self) -> Response:

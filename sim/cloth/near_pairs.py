@@ -38,9 +38,10 @@ triangles, vertices alone then push."""
 END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
-LANES, PARTS = 32, 4
-"""Threads of a GPU for a pair of patches, one for each edge or so; and how many times as many for a search, one for
-each block: few pairs are searched at rest, and a thread takes long."""
+LANES, EDGE_PARTS, VERTEX_PARTS = 32, 2, 4
+"""Threads of a GPU for a pair of patches, one for each edge or so; how many times as many search for edges, one for
+each block that an edge is compared with; and how many of the threads share a vertex, of which a patch has a third as
+many as edges: each a part of the block of triangles that it is compared with."""
 
 
 def lanes_of_pair() -> int:
@@ -48,9 +49,9 @@ def lanes_of_pair() -> int:
     return LANES if runs_on_gpu() else 1
 
 
-def parts_of_search() -> int:
-    """How many times as many share a search, by the blocks of elements that an element is compared with."""
-    return PARTS if runs_on_gpu() else 1
+def parts_of_search() -> tuple[int, int]:
+    """How many times as many search for edges, by their blocks; and how many share a vertex, by parts of a block."""
+    return (EDGE_PARTS, VERTEX_PARTS) if runs_on_gpu() else (1, 1)
 
 
 ALONG_NORMAL = 0.5
@@ -95,15 +96,19 @@ def pair_vertices_with_triangles(
     p: ti.i32,
     thread: ti.i32,
     lanes: ti.i32,
-    parts: ti.i32,
+    parts: ti.template(),
     met: PatchPairArrays,
     boxes: Boxes,
     surface: Surface,
     blocks: PatchBlocks,
     found: PairPieces,
 ):
-    """List the vertices of each of two patches that are near triangles of the other, as one of several threads."""
-    soonest, lane, part = NEVER, thread % lanes, thread // lanes
+    """List the vertices of each of two patches that are near triangles of the other, as one of several threads, of
+    which `parts` share a vertex.
+    """
+    tested = ti.static(BLOCK // parts)
+    soonest, at_once = NEVER, lanes // parts
+    lane, low = thread % at_once, thread // at_once * tested
     for side in range(2):
         m, other = met.pairs[p][side], met.pairs[p][1 - side]
         place = blocks.vertices.first[m] + lane
@@ -112,21 +117,20 @@ def pair_vertices_with_triangles(
             place = blocks.vertices.first[m + 1]
         while place < blocks.vertices.first[m + 1]:
             v = blocks.vertices.nodes[place]
-            place += lanes
+            place += at_once
             x = surface.position[v]
             if (x >= least).all() and (x <= most).all():
                 within = met.reach[p] * met.reach[p]
-                first, end = blocks.triangles.first_block[other] + part, blocks.triangles.first_block[other + 1]
-                for k_block in range((end - first + parts - 1) // parts):
-                    near, block = 0, first + k_block * parts
-                    for k in range(BLOCK):
-                        t = block * BLOCK + k
+                for block in range(blocks.triangles.first_block[other], blocks.triangles.first_block[other + 1]):
+                    near, first = 0, block * BLOCK + low
+                    for k in range(tested):
+                        t = first + k
                         dx = ti.max(blocks.triangles.low_x[t] - x[0], x[0] - blocks.triangles.high_x[t], 0.0)
                         dy = ti.max(blocks.triangles.low_y[t] - x[1], x[1] - blocks.triangles.high_y[t], 0.0)
                         dz = ti.max(blocks.triangles.low_z[t] - x[2], x[2] - blocks.triangles.high_z[t], 0.0)
                         near |= ti.select(dx * dx + dy * dy + dz * dz <= within, 1, 0) << k
                     while near != 0:
-                        t = block * BLOCK + lowest_bit(near)
+                        t = first + lowest_bit(near)
                         near &= near - 1
                         corners = blocks.triangles.triangles[t]
                         own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
@@ -141,7 +145,7 @@ def pair_vertices_with_triangles(
                                     found.pairs[there] = Four(v, corners[0], corners[1], corners[2])
                                     found.wanted[there], found.due[there] = UNKNOWN, met.slack[p] - apart
                                     soonest = ti.max(soonest, met.slack[p] - apart)
-    raise_to(found.piece_due, p, soonest, lane)
+    raise_to(found.piece_due, p, soonest, thread)
 
 
 @func
@@ -236,23 +240,35 @@ def carry_pieces(
 ) -> ti.i32:
     """Pieces of the pairs of patches that were listed before, at the places of their numbers now; returns the end.
 
+    Those that have any elements are listed in `again` meanwhile, as most have none.
+
     Args:
         carried: numbers that pairs of patches had before, or -1.
     """
-    ends[number] = 0
+    lanes = ti.static(lanes_of_pair())
+    ends[number], ends[2 + number] = 0, 0
+    for p in range(count):
+        now.pieces[p], now.piece_due[p] = Four(0), NEVER
+        if carried[p] >= 0 and before.pieces[carried[p]][2] > 0:
+            found = before.pieces[carried[p]][2]
+            now.pieces[p] = Four(ti.atomic_add(ends[number], found), found, found, 0)
+            now.piece_due[p] = before.piece_due[carried[p]]
+            now.again[ti.atomic_add(ends[2 + number], 1)] = p
+    moved, moving = ends[2 + number], workers
+    if ti.static(runs_on_gpu()):
+        moving = moved * lanes
     begin_sharing(taken, 0)
-    for worker in range(workers):
-        p = next_item(-1, worker, taken, 0, CARRIED_AT_A_TIME)
-        while p < count:
-            now.pieces[p], now.piece_due[p] = Four(0), NEVER
-            if carried[p] >= 0:
-                first, found = before.pieces[carried[p]][0], before.pieces[carried[p]][2]
-                start = ti.atomic_add(ends[number], found)
-                now.pieces[p], now.piece_due[p] = Four(start, found, found, 0), before.piece_due[carried[p]]
-                for k in range(found):
-                    now.pairs[start + k] = before.pairs[first + k]
-                    now.wanted[start + k], now.due[start + k] = before.wanted[first + k], before.due[first + k]
-            p = next_item(p, worker, taken, 0, CARRIED_AT_A_TIME)
+    for worker in range(moving):
+        item = next_item(-1, worker, taken, 0, CARRIED_AT_A_TIME)
+        while item < moved * lanes:
+            p = now.again[item // lanes]
+            first, start, k = before.pieces[carried[p]][0], now.pieces[p][0], item % lanes
+            while k < now.pieces[p][2]:
+                now.pairs[start + k] = before.pairs[first + k]
+                now.wanted[start + k], now.due[start + k] = before.wanted[first + k], before.due[first + k]
+                k += lanes
+            item = next_item(item, worker, taken, 0, CARRIED_AT_A_TIME)
+    ends[2 + number] = 0
     return ends[number]
 
 
@@ -442,14 +458,14 @@ def find_near_pairs(
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     lanes = ti.static(lanes_of_pair())
-    parts = ti.static(parts_of_search())
-    threads = ti.static(lanes * parts)
+    parts, of_vertex = ti.static(parts_of_search())
+    threads = ti.static(lanes * (1 + parts))
     holds = ti.cast(counters.found[2] == 0, ti.i32)
     count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[3]
     enclosing = searching = ti.min(count, 1) * workers
     looking = ti.min(due_count, 1) * workers
     if ti.static(runs_on_gpu()):
-        enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), 2 * count * threads
+        enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), count * threads
         looking = 2 * due_count * lanes
     if count > 0:
         lists.ends[2], lists.ends[3] = 0, 0
@@ -466,15 +482,16 @@ def find_near_pairs(
     begin_sharing(counters.taken, 1)
     for worker in range(searching):
         item = next_item(-1, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
-        while item < 2 * count * threads:
-            if item < count * threads:
-                p = met.expired[item // threads]
+        while item < count * threads:
+            thread = item - count * lanes
+            if thread < 0:
+                p = met.expired[item // lanes]
                 pair_vertices_with_triangles(
-                    p, item % threads, lanes, parts, met, boxes, surface, blocks, lists.triangles
+                    p, item % lanes, lanes, of_vertex, met, boxes, surface, blocks, lists.triangles
                 )
             else:
-                p = met.expired[item // threads - count]
-                pair_edges(p, item % threads, lanes, parts, met, boxes, blocks.edges, lists.edges)
+                p = met.expired[thread // (lanes * parts)]
+                pair_edges(p, thread % (lanes * parts), lanes, parts, met, boxes, blocks.edges, lists.edges)
             item = next_item(item, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
@@ -487,19 +504,20 @@ def find_near_pairs(
     short, short_edges = fits * lists.ends[2], fits * lists.ends[3]
     searching_again, looking_now = ti.min(short + short_edges, 1) * workers, fits * looking
     if ti.static(runs_on_gpu()):
-        searching_again = (short + short_edges) * threads
+        searching_again = short * lanes + short_edges * lanes * parts
     begin_sharing(counters.taken, 2)
     for worker in range(searching_again):
         item = next_item(-1, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
-        while item < (short + short_edges) * threads:
-            if item < short * threads:
-                p = lists.triangles.again[item // threads]
+        while item < short * lanes + short_edges * lanes * parts:
+            thread = item - short * lanes
+            if thread < 0:
+                p = lists.triangles.again[item // lanes]
                 pair_vertices_with_triangles(
-                    p, item % threads, lanes, parts, met, boxes, surface, blocks, lists.triangles
+                    p, item % lanes, lanes, of_vertex, met, boxes, surface, blocks, lists.triangles
                 )
             else:
-                p = lists.edges.again[item // threads - short]
-                pair_edges(p, item % threads, lanes, parts, met, boxes, blocks.edges, lists.edges)
+                p = lists.edges.again[thread // (lanes * parts)]
+                pair_edges(p, thread % (lanes * parts), lanes, parts, met, boxes, blocks.edges, lists.edges)
             item = next_item(item, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
     begin_sharing(counters.taken, 3)
     for worker in range(looking_now):

@@ -282,20 +282,22 @@ def pair_patches(
                     if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
                         slot = ti.atomic_add(counter[0], 1)
                         if slot < capacity:
-                            before = -1
-                            for place in range(known.first[2 * m], known.first[2 * m + 1]):
-                                if known.pairs[known.known[place]][1] == other:
-                                    before = known.known[place]
-                            now.pairs[slot], carried[slot] = ti.Vector([m, other]), before
-                            now.wake[slot], now.left[slot], now.approach[slot], now.allowed[slot] = -1.0, FAR, 0.0, 0.0
-                            now.slack[slot] = -1.0
-                            if before >= 0:
-                                now.slack[slot] = known.slack[before]
+                            now.pairs[slot] = ti.Vector([m, other])
                     # On to the next node that is not below this one; 0 after the last.
                     while node % 2 == 1:
                         node = node // 2
                     node += ti.cast(node > 0, ti.i32)
             m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+    end = ti.min(counter[0], capacity)
+    for p in range(end):
+        m, other, before = now.pairs[p][0], now.pairs[p][1], -1
+        for place in range(known.first[2 * m], known.first[2 * m + 1]):
+            if known.pairs[known.known[place]][1] == other:
+                before = known.known[place]
+        carried[p], now.slack[p] = before, -1.0
+        if before >= 0:
+            now.slack[p] = known.slack[before]
+        now.wake[p], now.left[p], now.approach[p], now.allowed[p] = -1.0, FAR, 0.0, 0.0
     return counter[0]
 
 

@@ -13,6 +13,7 @@ from sim.core.bundles import func, with_room
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import LEAST_RUN
+from sim.core.warps import WARP, largest_in_warp, on_cuda, whole_warps
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
@@ -402,16 +403,19 @@ def measure_excess(
     springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
 ) -> ti.math.vec2:
     """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
-    end = count
+    end, whole_end = count, whole_warps(count)
     found[0], found[1] = 0, 0
-    for s in range(end):
-        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        excess = excess_of(
-            i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
-        )
-        bits = ti.bit_cast(excess, ti.i32)  # those of numbers from 0 on are in their order
-        if excess > 0.0 and bits > found[0]:  # all others would wait in line to change nothing
-            ti.atomic_max(found[0], bits)
+    for s in range(whole_end):
+        excess = 0.0
+        if s < end:
+            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+            excess = excess_of(
+                i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
+            )
+        # Bits of numbers from 0 on are in their order.
+        largest = largest_in_warp(ti.bit_cast(ti.select(excess > 0.0, excess, 0.0), ti.i32))
+        if largest > found[0] and (ti.static(not on_cuda()) or s % WARP == 0):  # others would wait to change nothing
+            ti.atomic_max(found[0], largest)
         if excess > LARGEST_RESIDUAL:
             ti.atomic_add(found[1], 1)
     return ti.math.vec2(ti.bit_cast(found[0], ti.f32), ti.cast(found[1], ti.f32))
