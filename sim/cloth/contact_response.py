@@ -225,6 +225,8 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
+    if is_first == 1:
+        sums.rounds[0] = 1
     for i in range(all_end):
         if i < vertex_count:
             sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
@@ -363,7 +365,9 @@ Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
 
 @func
-def push_apart(momenta: Momenta, starts: ti.i32, count: ti.i32, touched_count: ti.i32, r: Response):
+def push_apart(
+    momenta: Momenta, starts: ti.i32, count: ti.i32, touched_count: ti.i32, bodies_count: ti.i32, r: Response
+):
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
     The first launch of an iteration, which `starts` it, notes where that is.
@@ -373,14 +377,14 @@ def push_apart(momenta: Momenta, starts: ti.i32, count: ti.i32, touched_count: t
     """
     impulses, nodes, bodies = ti.static((r.impulses, r.nodes, r.bodies))
     contacts_end, touched_end = count, touched_count  # before the first loop, as below
-    moved_end = touched_count + bodies.count
-    new_end = starts * ti.max(count, touched_count, bodies.count)
+    moved_end = touched_count + bodies_count
+    new_end = starts * ti.max(count, touched_count, bodies_count)
     for place in range(new_end):
         if place < touched_count:
             i = nodes.touched[place]
             nodes.start[i] = nodes.displacement[i]
             nodes.reached[i] = nodes.displacement[i]
-        if place < bodies.count:
+        if place < bodies_count:
             for m in ti.static(range(2)):
                 bodies.motion_start[2 * place + m] = bodies.motion[2 * place + m]
                 bodies.motion_reached[2 * place + m] = bodies.motion[2 * place + m]
@@ -489,26 +493,36 @@ TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they
 
 @large_kernel
 def push(
-    momenta: Momenta, starts: ti.i32, settles: ti.i32, finishes: ti.i32, r: Response, thickness: Floats
+    momenta: Momenta,
+    starts: ti.i32,
+    settles: ti.i32,
+    finishes: ti.i32,
+    is_ahead: ti.i32,
+    r: Response,
+    thickness: Floats,
 ) -> ti.math.ivec4:
     """Some steps of the iteration of a round of contacts that were weighed (`weigh_contacts`), and where they lead if
-    it `finishes`; first those that one step solves, if it `settles` them.
+    it `finishes`; first those that one step solves, if it `settles` them. Nothing is done if it `is_ahead` of rounds
+    that do not go on.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
     `TOLERANCE` then, and whether any are settled.
     """
     contacts, sums = ti.static((r.contacts, r.sums))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    pushing_count, touched_count = sums.counter[0], sums.counter[1]
-    measured_end, settled_end = finishes * pushing_count, settles * sums.counter[4] * contacts.counter[3]
-    sums.counter[3] = 0
+    goes_on = ti.select(is_ahead == 1, sums.rounds[0], 1)
+    pushing_count, touched_count = goes_on * sums.counter[0], goes_on * sums.counter[1]
+    measured_end, settled_end = finishes * pushing_count, goes_on * settles * sums.counter[4] * contacts.counter[3]
+    sums.rounds[2] = sums.counter[0] + sums.counter[4]
+    if goes_on == 1:
+        sums.counter[3] = 0
     settle_all(settled_end, r)
-    push_apart(momenta, starts, pushing_count, touched_count, r)
-    finish_push(finishes, pushing_count, touched_count, r)
+    push_apart(momenta, goes_on * starts, pushing_count, touched_count, goes_on * r.bodies.count, r)
+    finish_push(goes_on * finishes, pushing_count, touched_count, r)
     for place in range(measured_end):
         c = r.impulses.pushing[place]
         w = relative_displacement(c, r)
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
             sums.counter[3] = 1
-    return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])
+    return ti.math.ivec4(sums.counter[0], sums.counter[1], sums.counter[3], sums.counter[4])
