@@ -324,10 +324,9 @@ def is_settled(c: ti.i32, r: Response) -> ti.u1:
 
 
 @func
-def settle_all(count: ti.i32, r: Response):
-    """Settle those of so many contacts that one step solves."""
+def settle_all(count: ti.i32, whole_end: ti.i32, r: Response):
+    """Settle those of so many contacts that one step solves; `whole_end` is that of whole warps."""
     contacts, impulses, bodies = ti.static((r.contacts, r.impulses, r.bodies))
-    contacts_end, whole_end = count, whole_warps(count)
     for first in range(whole_end):
         # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
         if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
@@ -335,7 +334,7 @@ def settle_all(count: ti.i32, r: Response):
         given_body, given = -1, Given(0)
         for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
             push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
-            if c < contacts_end and impulses.mobility[c] > 0.0 and is_settled(c, r):
+            if c < count and impulses.mobility[c] > 0.0 and is_settled(c, r):
                 push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
             if ti.static(runs_on_gpu()):
                 give_body_together(push, body, arm, bodies.impulse, c)
@@ -365,26 +364,22 @@ Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
 
 @func
-def push_apart(
-    momenta: Momenta, starts: ti.i32, count: ti.i32, touched_count: ti.i32, bodies_count: ti.i32, r: Response
-):
+def push_apart(momenta: Momenta, new_end: ti.i32, count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Response):
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
-    The first launch of an iteration, which `starts` it, notes where that is.
+    The first launch of an iteration notes where that is, of all of the `new_end` places that there are; bodies follow
+    the vertices up to `moved_end`.
 
     A step starts from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them. It leaves the
     displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
     """
     impulses, nodes, bodies = ti.static((r.impulses, r.nodes, r.bodies))
-    contacts_end, touched_end = count, touched_count  # before the first loop, as below
-    moved_end = touched_count + bodies_count
-    new_end = starts * ti.max(count, touched_count, bodies_count)
     for place in range(new_end):
         if place < touched_count:
             i = nodes.touched[place]
             nodes.start[i] = nodes.displacement[i]
             nodes.reached[i] = nodes.displacement[i]
-        if place < bodies_count:
+        if place < bodies.count:
             for m in ti.static(range(2)):
                 bodies.motion_start[2 * place + m] = bodies.motion[2 * place + m]
                 bodies.motion_reached[2 * place + m] = bodies.motion[2 * place + m]
@@ -393,13 +388,13 @@ def push_apart(
             impulses.impulse_before[c] = impulses.impulse[c]
             impulses.impulse_given[c] = impulses.impulse[c]
     for step in ti.static(range(STEPS)):
-        for place in range(contacts_end):
+        for place in range(count):
             push_contact(place, momenta[step], r)
         for place in range(moved_end):
-            if place < touched_end:
+            if place < touched_count:
                 move_node(nodes.touched[place], momenta[step + 1], r)
             else:
-                move_body(place - touched_end, momenta[step + 1], r)
+                move_body(place - touched_count, momenta[step + 1], r)
 
 
 @func
@@ -460,32 +455,38 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
 
 
 @func
-def finish_push(finishes: ti.i32, count: ti.i32, touched_count: ti.i32, r: Response):
+def finish_push(count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Response):
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
-    Nothing where it does not finish yet: a kernel with it and one without would be compiled, for seconds each.
+    Nothing where there are no places, as it does not finish yet: a kernel with it and one without would be compiled,
+    for seconds each.
     """
     contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
-    contacts_end, touched_end, bodies_end = finishes * count, finishes * touched_count, finishes * bodies.count
-    for place in range(contacts_end):
+    for place in range(count):
         c = impulses.pushing[place]
         impulses.push[place] = (impulses.impulse[c] - impulses.impulse_given[c]) / impulses.unit
         if contacts.kind[c] >= 0:
             give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
-    for place in range(touched_end):
-        i = nodes.touched[place]
-        given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
-        nodes.displacement[i] = nodes.start[i] + (nodes.inverse_mass[i] * impulses.unit) * given
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for b in range(bodies_end):
-        for axis in ti.static(range(6)):
-            bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
-        bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(
-            bodies.gathered, 6 * b
-        )
-        twist = impulses.unit * take(bodies.gathered, 6 * b + 3)
-        bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
+    for place in range(moved_end):
+        if place < touched_count:
+            i = nodes.touched[place]
+            given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
+            nodes.displacement[i] = nodes.start[i] + (nodes.inverse_mass[i] * impulses.unit) * given
+        else:
+            leave_body(place - touched_count, r)
+
+
+@func
+def leave_body(b: ti.i32, r: Response):
+    """Motion of a body as the impulses of an iteration make it."""
+    (bodies,) = ti.static((r.bodies,))
+    for axis in ti.static(range(6)):
+        bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
+    bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * r.impulses.unit) * take(
+        bodies.gathered, 6 * b
+    )
+    twist = r.impulses.unit * take(bodies.gathered, 6 * b + 3)
+    bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
 
 
 TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they should keep
@@ -522,16 +523,20 @@ def push(
     elif is_ahead == OF_MORE_STEPS:
         goes_on = ti.cast(sums.rounds[0] == OVER and sums.counter[0] > 0 and sums.counter[3] == 1, ti.i32)
     pushing_count, touched_count = goes_on * sums.counter[0], goes_on * sums.counter[1]
-    measured_end, settled_end = finishes * pushing_count, goes_on * settles * sums.counter[4] * contacts.counter[3]
+    moved_end = touched_count + goes_on * r.bodies.count
+    new_end = starts * ti.max(pushing_count, moved_end)
+    finished_end, finished_moved_end = finishes * pushing_count, finishes * moved_end
+    settled_end = goes_on * settles * sums.counter[4] * contacts.counter[3]
+    whole_end = whole_warps(settled_end)
     sums.rounds[2] = sums.counter[0] + sums.counter[4]
     if goes_on * finishes == 1:
         sums.counter[3] = 0
         if is_ahead == OF_MORE_STEPS:
             sums.rounds[0] = OVER_WITH_MORE
-    settle_all(settled_end, r)
-    push_apart(momenta, goes_on * starts, pushing_count, touched_count, goes_on * r.bodies.count, r)
-    finish_push(goes_on * finishes, pushing_count, touched_count, r)
-    for place in range(measured_end):
+    settle_all(settled_end, whole_end, r)
+    push_apart(momenta, new_end, pushing_count, touched_count, moved_end, r)
+    finish_push(finished_end, touched_count, finished_moved_end, r)
+    for place in range(finished_end):
         c = r.impulses.pushing[place]
         w = relative_displacement(c, r)
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
