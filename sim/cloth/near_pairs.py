@@ -24,8 +24,8 @@ from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Results, Share, reduced, runs_on_gpu
-from sim.core.scheduling import begin_sharing, next_item
-from sim.core.warps import raise_to
+from sim.core.scheduling import NO_MORE, begin_sharing, next_item
+from sim.core.warps import WARP, raise_to, whole_warps
 
 OF_REST_DISTANCE = 0.7
 """Elements that are nearer than their thickness when the cloth is flat keep this part of their distance there."""
@@ -38,15 +38,20 @@ triangles, vertices alone then push."""
 END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
-LANES, EDGE_PARTS, VERTEX_PARTS = 32, 2, 4
-"""Threads of a GPU for a pair of patches, one for each edge or so; how many times as many search for edges, one for
-each block that an edge is compared with; and how many of the threads share a vertex, of which a patch has a third as
-many as edges: each a part of the block of triangles that it is compared with."""
+LANES, LANES_OF_PIECE, EDGE_PARTS, VERTEX_PARTS = 32, 8, 2, 4
+"""Threads of a GPU for a pair of patches, one for each edge or so, and for a piece of a list; how many times as many
+search for edges, one for each block that an edge is compared with; and how many of the threads share a vertex, of which
+a patch has a third as many as edges: each has a part of the block of triangles that it is compared with."""
 
 
 def lanes_of_pair() -> int:
     """Threads that share the work of a pair of patches."""
     return LANES if runs_on_gpu() else 1
+
+
+def lanes_of_piece() -> int:
+    """Threads that look at the elements of a pair of patches, of which most have some ten in each list."""
+    return LANES_OF_PIECE if runs_on_gpu() else 1
 
 
 def parts_of_search() -> tuple[int, int]:
@@ -145,7 +150,7 @@ def pair_vertices_with_triangles(
                                     found.pairs[there] = Four(v, corners[0], corners[1], corners[2])
                                     found.wanted[there], found.due[there] = UNKNOWN, met.slack[p] - apart
                                     soonest = ti.max(soonest, met.slack[p] - apart)
-    raise_to(found.piece_due, p, soonest, thread)
+    raise_to(found.piece_due, p, soonest, thread, WARP)
 
 
 @func
@@ -214,7 +219,7 @@ def pair_edges(
                                 )
                                 found.wanted[place_of_pair], found.due[place_of_pair] = UNKNOWN, met.slack[p] - apart
                                 soonest = ti.max(soonest, met.slack[p] - apart)
-    raise_to(found.piece_due, p, soonest, lane)
+    raise_to(found.piece_due, p, soonest, lane, WARP)
 
 
 @func
@@ -283,7 +288,7 @@ def keep_pairs(count: ti.i32, before: PairPieces, now: PairPieces):
 def look_at_piece(
     both: ti.i32,
     lane: ti.i32,
-    lanes: ti.i32,
+    lanes: ti.template(),
     listed: PairPieces,
     met: PatchPairArrays,
     are_edges: ti.template(),
@@ -292,15 +297,19 @@ def look_at_piece(
     recovery: ti.f32,
     contacts: Contacts,
 ):
-    """Look at the pairs of elements of one pair of patches that are due, as one of several threads."""
+    """Look at the pairs of elements of one pair of patches that are due, as one of several threads; or at none, as
+    `NO_MORE` of them.
+    """
     soonest, is_left = NEVER, met.left[both]
-    place, end = listed.pieces[both][0] + lane, listed.pieces[both][0] + listed.pieces[both][2]
+    place, end = lane, listed.pieces[both][2]
+    first = listed.pieces[both][0]
     while place < end:
-        if listed.due[place] >= is_left:
-            listed.due[place] = look_at_pair(place, both, listed, met, are_edges, surface, rest, recovery, contacts)
-        soonest = ti.max(soonest, listed.due[place])
+        p = first + place
+        if listed.due[p] >= is_left:
+            listed.due[p] = look_at_pair(p, both, listed, met, are_edges, surface, rest, recovery, contacts)
+        soonest = ti.max(soonest, listed.due[p])
         place += lanes
-    raise_to(listed.piece_due, both, soonest, lane)
+    raise_to(listed.piece_due, both, soonest, lane, lanes)
 
 
 @func
@@ -459,14 +468,16 @@ def find_near_pairs(
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     lanes = ti.static(lanes_of_pair())
     parts, of_vertex = ti.static(parts_of_search())
+    of_piece = ti.static(lanes_of_piece())
     threads = ti.static(lanes * (1 + parts))
     holds = ti.cast(counters.found[2] == 0, ti.i32)
     count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[3]
     enclosing = searching = ti.min(count, 1) * workers
+    due_end = whole_warps(due_count * of_piece)  # then those of edges, in warps of their own
     looking = ti.min(due_count, 1) * workers
     if ti.static(runs_on_gpu()):
         enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), count * threads
-        looking = 2 * due_count * lanes
+        looking = 2 * due_end
     if count > 0:
         lists.ends[2], lists.ends[3] = 0, 0
     begin_sharing(counters.taken, 0)
@@ -522,33 +533,14 @@ def find_near_pairs(
     begin_sharing(counters.taken, 3)
     for worker in range(looking_now):
         item = next_item(-1, worker, counters.taken, 3, DUE_AT_A_TIME)
-        while item < 2 * due_count * lanes:
-            if item < due_count * lanes:
-                look_at_piece(
-                    met.due[item // lanes],
-                    item % lanes,
-                    lanes,
-                    lists.triangles,
-                    met,
-                    False,
-                    surface,
-                    rest,
-                    recovery,
-                    contacts,
-                )
+        while item < 2 * due_end:
+            place = item % due_end // of_piece
+            lane = ti.select(place < due_count, item % of_piece, NO_MORE)
+            p = met.due[ti.min(place, due_count - 1)]
+            if item < due_end:
+                look_at_piece(p, lane, of_piece, lists.triangles, met, False, surface, rest, recovery, contacts)
             else:
-                look_at_piece(
-                    met.due[item // lanes - due_count],
-                    item % lanes,
-                    lanes,
-                    lists.edges,
-                    met,
-                    True,
-                    surface,
-                    rest,
-                    recovery,
-                    contacts,
-                )
+                look_at_piece(p, lane, of_piece, lists.edges, met, True, surface, rest, recovery, contacts)
             item = next_item(item, worker, counters.taken, 3, DUE_AT_A_TIME)
     lists.ends[2], lists.ends[3] = lists.ends[2] - short, lists.ends[3] - short_edges
     contacts.counter[1], contacts.counter[2], contacts.counter[4] = lists.ends[0], lists.ends[1], holds * fits
