@@ -285,17 +285,30 @@ def solve_threads(
                 one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-                i, j, w_i, w_j, n, length, compliance, before = 0, 0, 0.0, 0.0, ti.math.vec3(0.0), 1.0, 0.0, 0.0
+                at_x, at_y = ti.simt.block.SharedArray((rows,), ti.i32), ti.simt.block.SharedArray((rows,), ti.i32)
+                at_z = ti.simt.block.SharedArray((rows,), ti.i32)
+                # Nodes of columns are far from each other in memory: each is read once, by the thread of its place.
+                i, w_i, u, x = -1, 0.0, ti.math.vec3(0.0), ti.math.ivec3(0)
                 if k < count:
-                    i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-                    w_i, w_j = nodes.inverse_mass[i], nodes.inverse_mass[j]
-                    at_start = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
-                    d = at_start + (nodes.displacement[i] - nodes.displacement[j])
+                    i = springs.nodes[2 * s]
+                elif k == count:
+                    i = springs.nodes[2 * s - 1]
+                if i >= 0:
+                    w_i, u, x = nodes.inverse_mass[i], nodes.displacement[i], nodes.lattice[i]
+                one[k], of_x[k], of_y[k], of_z[k] = w_i, u.x, u.y, u.z
+                at_x[k], at_y[k], at_z[k] = x.x, x.y, x.z
+                ti.simt.block.sync()
+                w_j, n, length, compliance, before = 0.0, ti.math.vec3(0.0), 1.0, 0.0, 0.0
+                if k < count:
+                    w_j = one[k + 1]
+                    at_start = nodes.quantum * ti.cast(x - ti.math.ivec3(at_x[k + 1], at_y[k + 1], at_z[k + 1]), ti.f32)
+                    d = at_start + (u - ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1]))
                     length = ti.max(d.norm(), TINY_LENGTH)
                     n = direction_of(at_start, d / length)
                     compliance = 1.0 / (springs.law[s][1] * dt * dt)
                     if not is_first:
                         before = work.multiplier[s]
+                ti.simt.block.sync()
                 of_x[k], of_y[k], of_z[k] = n.x, n.y, n.z
                 if k == 0:
                     work.is_taut[p] = 0
@@ -320,13 +333,14 @@ def solve_threads(
                 push = change * n
                 of_x[k], of_y[k], of_z[k] = push.x, push.y, push.z
                 ti.simt.block.sync()
+                if i >= 0:
+                    moved = ti.math.vec3(0.0)
+                    if k < count:
+                        moved = push
+                    if k > 0:
+                        moved -= ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1])
+                    nodes.displacement[i] = u + w_i * moved
                 if k < count:
-                    moved = -push  # of the node that the spring leads to, which the next one leads from
-                    if k + 1 < count:
-                        moved += ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1])
-                    nodes.displacement[j] = nodes.displacement[j] + w_j * moved
-                    if k == 0:
-                        nodes.displacement[i] = nodes.displacement[i] + w_i * push
                     work.multiplier[s] = before + change
                     work.tension[s] = tension_to_turn(-(before + change) / length, w_i + w_j)
                     if work.tension[s] > 0.0:
