@@ -44,19 +44,9 @@ search for edges, one for each block that an edge is compared with; and how many
 a patch has a third as many as edges: each has a part of the block of triangles that it is compared with."""
 
 
-def lanes_of_pair() -> int:
-    """Threads that share the work of a pair of patches."""
-    return LANES if runs_on_gpu() else 1
-
-
-def lanes_of_piece() -> int:
-    """Threads that look at the elements of a pair of patches, of which most have some ten in each list."""
-    return LANES_OF_PIECE if runs_on_gpu() else 1
-
-
-def parts_of_search() -> tuple[int, int]:
-    """How many times as many search for edges, by their blocks; and how many share a vertex, by parts of a block."""
-    return (EDGE_PARTS, VERTEX_PARTS) if runs_on_gpu() else (1, 1)
+def on_gpu(threads: int) -> int:
+    """Threads that share some work on a GPU; on a CPU one does it."""
+    return threads if runs_on_gpu() else 1
 
 
 ALONG_NORMAL = 0.5
@@ -250,7 +240,7 @@ def carry_pieces(
     Args:
         carried: numbers that pairs of patches had before, or -1.
     """
-    lanes = ti.static(lanes_of_pair())
+    lanes = ti.static(on_gpu(LANES))
     ends[number], ends[2 + number] = 0, 0
     for p in range(count):
         now.pieces[p], now.piece_due[p] = Four(0), NEVER
@@ -466,9 +456,8 @@ def find_near_pairs(
         contacts: the list; its second and third number become the ends that both lists need.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    lanes = ti.static(lanes_of_pair())
-    parts, of_vertex = ti.static(parts_of_search())
-    of_piece = ti.static(lanes_of_piece())
+    lanes, of_piece = ti.static(on_gpu(LANES), on_gpu(LANES_OF_PIECE))
+    parts, of_vertex = ti.static(on_gpu(EDGE_PARTS), on_gpu(VERTEX_PARTS))
     threads = ti.static(lanes * (1 + parts))
     holds = ti.cast(counters.found[2] == 0, ti.i32)
     count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[3]

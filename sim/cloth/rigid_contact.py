@@ -19,7 +19,7 @@ from sim.cloth.bundles import (
     Walls,
     Weights,
 )
-from sim.cloth.near_pairs import lanes_of_pair
+from sim.cloth.near_pairs import LANES, on_gpu
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
@@ -290,7 +290,7 @@ class RigidContact:
             recovery: share of a missing distance that the substep gives back [-].
         """
         is_alone, shows = not (self._walls.count or self.bodies.count), self._shows.any()
-        lanes = lanes_of_pair() if shows else min(lanes_of_pair(), LANES_OF_VERTICES)
+        lanes = on_gpu(LANES if shows else LANES_OF_VERTICES)
         return find_rigid_contacts.later(
             PatchLists(patches.vertex_lists, patches.elements),
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
