@@ -26,6 +26,7 @@ import taichi as ti
 from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, Response
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import INACTIVE, WALL
+from sim.cloth.state import GO_ON, OVER, OVER_WITH_MORE
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import large_kernel
@@ -213,18 +214,19 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
     without the twelve atomic sums that each contact would otherwise take.
 
-    What stands and touches a vertex that nothing else touches is settled at once: its D is exact, so that one step
-    solves it, and no other contact hears of it. In draped cloth these are most of all that push.
+    What stands and touches a vertex that nothing else touches is settled in one step (`settle_all`): its D is exact,
+    and no other contact hears of it. In draped cloth these are most of all that push.
 
     If bodies may move, each vertex between what stands and a body that moves gets its `support`, and its contacts a
     normal along that, from `held_sums`, `lever` and `pressing_body`.
     """
     contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end, weighed_end = contacts.counter[3], vertex_count, whole_warps(contacts.counter[3])
+    contacts_end, vertices_end = contacts.counter[3], vertex_count
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
+    sums.rounds[0] = ti.select(is_first == 1, GO_ON, OVER)
     for i in range(all_end):
         if i < vertex_count:
             sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
@@ -271,34 +273,18 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
                 of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
                 own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
                 nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
-    for first in range(weighed_end):
-        # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
-        if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
-            continue
-        given_body, given = -1, Given(0)
-        for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
-            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
-            if c < contacts_end and impulses.mobility[c] > 0.0:
-                if is_first == 1:
-                    impulses.impulse[c] = ti.math.vec3(0.0)
-                v = contacts.vertices[c][0]
-                if nodes.uses[2 * v] == ALONE and is_of_vertex_and_what_stands(c, contacts, bodies):
-                    impulses.mobility[c] = nodes.inverse_mass[v]
-                    push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
-                    if sums.counter[4] == 0:
-                        sums.counter[4] = 1
-                else:
-                    place = ti.atomic_add(sums.counter[0], 1)
-                    impulses.pushing[place] = c
-                    impulses.mobility[c] = weighed(c, place, r)
-            if ti.static(runs_on_gpu()):
-                give_body_together(push, body, arm, bodies.impulse, c)
-            elif body >= 0:
-                if body != given_body:
-                    give(given, given_body, bodies.impulse)
-                    given_body, given = body, Given(0)
-                given += opposite_of(push, arm)
-        give(given, given_body, bodies.impulse)
+    for c in range(contacts_end):
+        if impulses.mobility[c] > 0.0:
+            if is_first == 1:
+                impulses.impulse[c] = ti.math.vec3(0.0)
+            if is_settled(c, r):
+                impulses.mobility[c] = nodes.inverse_mass[contacts.vertices[c][0]]
+                if sums.counter[4] == 0:
+                    sums.counter[4] = 1
+            else:
+                place = ti.atomic_add(sums.counter[0], 1)
+                impulses.pushing[place] = c
+                impulses.mobility[c] = weighed(c, place, r)
 
 
 @func
@@ -330,6 +316,37 @@ def is_of_vertex_and_what_stands(c: ti.i32, contacts: Contacts, bodies: PushedBo
 
 
 @func
+def is_settled(c: ti.i32, r: Response) -> ti.u1:
+    """Whether a contact that pushes is settled in one step."""
+    return r.nodes.uses[2 * r.contacts.vertices[c][0]] == ALONE and is_of_vertex_and_what_stands(
+        c, r.contacts, r.bodies
+    )
+
+
+@func
+def settle_all(count: ti.i32, whole_end: ti.i32, r: Response):
+    """Settle those of so many contacts that one step solves; `whole_end` is that of whole warps."""
+    contacts, impulses, bodies = ti.static((r.contacts, r.impulses, r.bodies))
+    for first in range(whole_end):
+        # Contacts of a body are neighbours in the list, and threads that add to it wait for each other.
+        if first % ti.static(1 if runs_on_gpu() else AT_A_TIME) != 0:
+            continue
+        given_body, given = -1, Given(0)
+        for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
+            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
+            if c < count and impulses.mobility[c] > 0.0 and is_settled(c, r):
+                push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
+            if ti.static(runs_on_gpu()):
+                give_body_together(push, body, arm, bodies.impulse, c)
+            elif body >= 0:
+                if body != given_body:
+                    give(given, given_body, bodies.impulse)
+                    given_body, given = body, Given(0)
+                given += opposite_of(push, arm)
+        give(given, given_body, bodies.impulse)
+
+
+@func
 def settle(c: ti.i32, r: Response) -> ti.math.vec3:
     """Push the only vertex of a contact, which has no other, by all that it lacks; returns that, in units."""
     impulses, nodes = ti.static((r.impulses, r.nodes))
@@ -347,18 +364,16 @@ Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
 
 @func
-def push_apart(momenta: Momenta, starts: ti.i32, count: ti.i32, touched_count: ti.i32, r: Response):
+def push_apart(momenta: Momenta, new_end: ti.i32, count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Response):
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
-    The first launch of an iteration, which `starts` it, notes where that is.
+    The first launch of an iteration notes where that is, of all of the `new_end` places that there are; bodies follow
+    the vertices up to `moved_end`.
 
     A step starts from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them. It leaves the
     displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
     """
     impulses, nodes, bodies = ti.static((r.impulses, r.nodes, r.bodies))
-    contacts_end, touched_end = count, touched_count  # before the first loop, as below
-    moved_end = touched_count + bodies.count
-    new_end = starts * ti.max(count, touched_count, bodies.count)
     for place in range(new_end):
         if place < touched_count:
             i = nodes.touched[place]
@@ -373,13 +388,13 @@ def push_apart(momenta: Momenta, starts: ti.i32, count: ti.i32, touched_count: t
             impulses.impulse_before[c] = impulses.impulse[c]
             impulses.impulse_given[c] = impulses.impulse[c]
     for step in ti.static(range(STEPS)):
-        for place in range(contacts_end):
+        for place in range(count):
             push_contact(place, momenta[step], r)
         for place in range(moved_end):
-            if place < touched_end:
+            if place < touched_count:
                 move_node(nodes.touched[place], momenta[step + 1], r)
             else:
-                move_body(place - touched_end, momenta[step + 1], r)
+                move_body(place - touched_count, momenta[step + 1], r)
 
 
 @func
@@ -440,54 +455,92 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
 
 
 @func
-def finish_push(finishes: ti.i32, count: ti.i32, touched_count: ti.i32, r: Response):
+def finish_push(count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Response):
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
-    Nothing where it does not finish yet: a kernel with it and one without would be compiled, for seconds each.
+    Nothing where there are no places, as it does not finish yet: a kernel with it and one without would be compiled,
+    for seconds each.
     """
     contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
-    contacts_end, touched_end, bodies_end = finishes * count, finishes * touched_count, finishes * bodies.count
-    for place in range(contacts_end):
+    for place in range(count):
         c = impulses.pushing[place]
         impulses.push[place] = (impulses.impulse[c] - impulses.impulse_given[c]) / impulses.unit
         if contacts.kind[c] >= 0:
             give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
-    for place in range(touched_end):
-        i = nodes.touched[place]
-        given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
-        nodes.displacement[i] = nodes.start[i] + (nodes.inverse_mass[i] * impulses.unit) * given
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for b in range(bodies_end):
-        for axis in ti.static(range(6)):
-            bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
-        bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * impulses.unit) * take(
-            bodies.gathered, 6 * b
-        )
-        twist = impulses.unit * take(bodies.gathered, 6 * b + 3)
-        bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
+    for place in range(moved_end):
+        if place < touched_count:
+            i = nodes.touched[place]
+            given = answer_of(nodes.support[i]) * given_to(i, nodes.uses, impulses)
+            nodes.displacement[i] = nodes.start[i] + (nodes.inverse_mass[i] * impulses.unit) * given
+        else:
+            leave_body(place - touched_count, r)
+
+
+@func
+def leave_body(b: ti.i32, r: Response):
+    """Motion of a body as the impulses of an iteration make it."""
+    (bodies,) = ti.static((r.bodies,))
+    for axis in ti.static(range(6)):
+        bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
+    bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * r.impulses.unit) * take(
+        bodies.gathered, 6 * b
+    )
+    twist = r.impulses.unit * take(bodies.gathered, 6 * b + 3)
+    bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
 
 
 TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they should keep
 
+NOT_AHEAD, OF_TURN, OF_MORE_STEPS = range(3)
+"""Whether steps were asked for before it was known that they are needed: those of another turn of springs, or more
+where a round was not enough."""
+
+Pushed = ti.types.vector(5, ti.i32)
+
 
 @large_kernel
-def push(momenta: Momenta, starts: ti.i32, finishes: ti.i32, r: Response, thickness: Floats) -> ti.math.ivec4:
-    """Some steps of the iteration of a round (`weigh_contacts`), and where they lead if it `finishes`.
+def push(
+    momenta: Momenta,
+    starts: ti.i32,
+    settles: ti.i32,
+    finishes: ti.i32,
+    is_ahead: ti.i32,
+    r: Response,
+    thickness: Floats,
+) -> Pushed:
+    """Some steps of the iteration of a round of contacts that were weighed (`weigh_contacts`), and where they lead if
+    it `finishes`; first those that one step solves, if it `settles` them. If it `is_ahead`, nothing is done unless it
+    is needed: `OF_TURN` if rounds go on, `OF_MORE_STEPS` if they are over, and some contact misses what it should keep.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
-    `TOLERANCE` then, and whether any were settled.
+    `TOLERANCE` then, whether any are settled, and whether more steps were needed, and done.
     """
     contacts, sums = ti.static((r.contacts, r.sums))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    pushing_count, touched_count = sums.counter[0], sums.counter[1]
-    measured_end = finishes * pushing_count
-    push_apart(momenta, starts, pushing_count, touched_count, r)
-    finish_push(finishes, pushing_count, touched_count, r)
-    for place in range(measured_end):
+    goes_on = 1
+    if is_ahead == OF_TURN:
+        goes_on = ti.cast(sums.rounds[0] == GO_ON, ti.i32)
+    elif is_ahead == OF_MORE_STEPS:
+        goes_on = ti.cast(sums.rounds[0] == OVER and sums.counter[0] > 0 and sums.counter[3] == 1, ti.i32)
+    pushing_count, touched_count = goes_on * sums.counter[0], goes_on * sums.counter[1]
+    moved_end = touched_count + goes_on * r.bodies.count
+    new_end = starts * ti.max(pushing_count, moved_end)
+    finished_end, finished_moved_end = finishes * pushing_count, finishes * moved_end
+    settled_end = goes_on * settles * sums.counter[4] * contacts.counter[3]
+    whole_end = whole_warps(settled_end)
+    sums.rounds[2] = sums.counter[0] + sums.counter[4]
+    if goes_on * finishes == 1:
+        sums.counter[3] = 0
+        if is_ahead == OF_MORE_STEPS:
+            sums.rounds[0] = OVER_WITH_MORE
+    settle_all(settled_end, whole_end, r)
+    push_apart(momenta, new_end, pushing_count, touched_count, moved_end, r)
+    finish_push(finished_end, touched_count, finished_moved_end, r)
+    for place in range(finished_end):
         c = r.impulses.pushing[place]
         w = relative_displacement(c, r)
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
             sums.counter[3] = 1
-    return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])
+    is_more = ti.cast(sums.rounds[0] == OVER_WITH_MORE, ti.i32)
+    return Pushed(sums.counter[0], sums.counter[1], sums.counter[3], sums.counter[4], is_more)

@@ -24,8 +24,8 @@ from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Results, Share, reduced, runs_on_gpu
-from sim.core.scheduling import begin_sharing, next_item
-from sim.core.warps import raise_to
+from sim.core.scheduling import NO_MORE, begin_sharing, next_item
+from sim.core.warps import WARP, raise_to, whole_warps
 
 OF_REST_DISTANCE = 0.7
 """Elements that are nearer than their thickness when the cloth is flat keep this part of their distance there."""
@@ -38,19 +38,15 @@ triangles, vertices alone then push."""
 END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
-LANES, PARTS = 32, 4
-"""Threads of a GPU for a pair of patches, one for each edge or so; and how many times as many for a search, one for
-each block: few pairs are searched at rest, and a thread takes long."""
+LANES, LANES_OF_PIECE, EDGE_PARTS, VERTEX_PARTS = 32, 8, 2, 4
+"""Threads of a GPU for a pair of patches, one for each edge or so, and for a piece of a list; how many times as many
+search for edges, one for each block that an edge is compared with; and how many of the threads share a vertex, of which
+a patch has a third as many as edges: each has a part of the block of triangles that it is compared with."""
 
 
-def lanes_of_pair() -> int:
-    """Threads that share the work of a pair of patches."""
-    return LANES if runs_on_gpu() else 1
-
-
-def parts_of_search() -> int:
-    """How many times as many share a search, by the blocks of elements that an element is compared with."""
-    return PARTS if runs_on_gpu() else 1
+def on_gpu(threads: int) -> int:
+    """Threads that share some work on a GPU; on a CPU one does it."""
+    return threads if runs_on_gpu() else 1
 
 
 ALONG_NORMAL = 0.5
@@ -95,15 +91,19 @@ def pair_vertices_with_triangles(
     p: ti.i32,
     thread: ti.i32,
     lanes: ti.i32,
-    parts: ti.i32,
+    parts: ti.template(),
     met: PatchPairArrays,
     boxes: Boxes,
     surface: Surface,
     blocks: PatchBlocks,
     found: PairPieces,
 ):
-    """List the vertices of each of two patches that are near triangles of the other, as one of several threads."""
-    soonest, lane, part = NEVER, thread % lanes, thread // lanes
+    """List the vertices of each of two patches that are near triangles of the other, as one of several threads, of
+    which `parts` share a vertex.
+    """
+    tested = ti.static(BLOCK // parts)
+    soonest, at_once = NEVER, lanes // parts
+    lane, low = thread % at_once, thread // at_once * tested
     for side in range(2):
         m, other = met.pairs[p][side], met.pairs[p][1 - side]
         place = blocks.vertices.first[m] + lane
@@ -112,21 +112,20 @@ def pair_vertices_with_triangles(
             place = blocks.vertices.first[m + 1]
         while place < blocks.vertices.first[m + 1]:
             v = blocks.vertices.nodes[place]
-            place += lanes
+            place += at_once
             x = surface.position[v]
             if (x >= least).all() and (x <= most).all():
                 within = met.reach[p] * met.reach[p]
-                first, end = blocks.triangles.first_block[other] + part, blocks.triangles.first_block[other + 1]
-                for k_block in range((end - first + parts - 1) // parts):
-                    near, block = 0, first + k_block * parts
-                    for k in range(BLOCK):
-                        t = block * BLOCK + k
+                for block in range(blocks.triangles.first_block[other], blocks.triangles.first_block[other + 1]):
+                    near, first = 0, block * BLOCK + low
+                    for k in range(tested):
+                        t = first + k
                         dx = ti.max(blocks.triangles.low_x[t] - x[0], x[0] - blocks.triangles.high_x[t], 0.0)
                         dy = ti.max(blocks.triangles.low_y[t] - x[1], x[1] - blocks.triangles.high_y[t], 0.0)
                         dz = ti.max(blocks.triangles.low_z[t] - x[2], x[2] - blocks.triangles.high_z[t], 0.0)
                         near |= ti.select(dx * dx + dy * dy + dz * dz <= within, 1, 0) << k
                     while near != 0:
-                        t = block * BLOCK + lowest_bit(near)
+                        t = first + lowest_bit(near)
                         near &= near - 1
                         corners = blocks.triangles.triangles[t]
                         own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
@@ -141,7 +140,7 @@ def pair_vertices_with_triangles(
                                     found.pairs[there] = Four(v, corners[0], corners[1], corners[2])
                                     found.wanted[there], found.due[there] = UNKNOWN, met.slack[p] - apart
                                     soonest = ti.max(soonest, met.slack[p] - apart)
-    raise_to(found.piece_due, p, soonest, lane)
+    raise_to(found.piece_due, p, soonest, thread, WARP)
 
 
 @func
@@ -210,7 +209,7 @@ def pair_edges(
                                 )
                                 found.wanted[place_of_pair], found.due[place_of_pair] = UNKNOWN, met.slack[p] - apart
                                 soonest = ti.max(soonest, met.slack[p] - apart)
-    raise_to(found.piece_due, p, soonest, lane)
+    raise_to(found.piece_due, p, soonest, lane, WARP)
 
 
 @func
@@ -236,23 +235,35 @@ def carry_pieces(
 ) -> ti.i32:
     """Pieces of the pairs of patches that were listed before, at the places of their numbers now; returns the end.
 
+    Those that have any elements are listed in `again` meanwhile, as most have none.
+
     Args:
         carried: numbers that pairs of patches had before, or -1.
     """
-    ends[number] = 0
+    lanes = ti.static(on_gpu(LANES))
+    ends[number], ends[2 + number] = 0, 0
+    for p in range(count):
+        now.pieces[p], now.piece_due[p] = Four(0), NEVER
+        if carried[p] >= 0 and before.pieces[carried[p]][2] > 0:
+            found = before.pieces[carried[p]][2]
+            now.pieces[p] = Four(ti.atomic_add(ends[number], found), found, found, 0)
+            now.piece_due[p] = before.piece_due[carried[p]]
+            now.again[ti.atomic_add(ends[2 + number], 1)] = p
+    moved, moving = ends[2 + number], workers
+    if ti.static(runs_on_gpu()):
+        moving = moved * lanes
     begin_sharing(taken, 0)
-    for worker in range(workers):
-        p = next_item(-1, worker, taken, 0, CARRIED_AT_A_TIME)
-        while p < count:
-            now.pieces[p], now.piece_due[p] = Four(0), NEVER
-            if carried[p] >= 0:
-                first, found = before.pieces[carried[p]][0], before.pieces[carried[p]][2]
-                start = ti.atomic_add(ends[number], found)
-                now.pieces[p], now.piece_due[p] = Four(start, found, found, 0), before.piece_due[carried[p]]
-                for k in range(found):
-                    now.pairs[start + k] = before.pairs[first + k]
-                    now.wanted[start + k], now.due[start + k] = before.wanted[first + k], before.due[first + k]
-            p = next_item(p, worker, taken, 0, CARRIED_AT_A_TIME)
+    for worker in range(moving):
+        item = next_item(-1, worker, taken, 0, CARRIED_AT_A_TIME)
+        while item < moved * lanes:
+            p = now.again[item // lanes]
+            first, start, k = before.pieces[carried[p]][0], now.pieces[p][0], item % lanes
+            while k < now.pieces[p][2]:
+                now.pairs[start + k] = before.pairs[first + k]
+                now.wanted[start + k], now.due[start + k] = before.wanted[first + k], before.due[first + k]
+                k += lanes
+            item = next_item(item, worker, taken, 0, CARRIED_AT_A_TIME)
+    ends[2 + number] = 0
     return ends[number]
 
 
@@ -267,7 +278,7 @@ def keep_pairs(count: ti.i32, before: PairPieces, now: PairPieces):
 def look_at_piece(
     both: ti.i32,
     lane: ti.i32,
-    lanes: ti.i32,
+    lanes: ti.template(),
     listed: PairPieces,
     met: PatchPairArrays,
     are_edges: ti.template(),
@@ -276,15 +287,19 @@ def look_at_piece(
     recovery: ti.f32,
     contacts: Contacts,
 ):
-    """Look at the pairs of elements of one pair of patches that are due, as one of several threads."""
+    """Look at the pairs of elements of one pair of patches that are due, as one of several threads; or at none, as
+    `NO_MORE` of them.
+    """
     soonest, is_left = NEVER, met.left[both]
-    place, end = listed.pieces[both][0] + lane, listed.pieces[both][0] + listed.pieces[both][2]
+    place, end = lane, listed.pieces[both][2]
+    first = listed.pieces[both][0]
     while place < end:
-        if listed.due[place] >= is_left:
-            listed.due[place] = look_at_pair(place, both, listed, met, are_edges, surface, rest, recovery, contacts)
-        soonest = ti.max(soonest, listed.due[place])
+        p = first + place
+        if listed.due[p] >= is_left:
+            listed.due[p] = look_at_pair(p, both, listed, met, are_edges, surface, rest, recovery, contacts)
+        soonest = ti.max(soonest, listed.due[p])
         place += lanes
-    raise_to(listed.piece_due, both, soonest, lane)
+    raise_to(listed.piece_due, both, soonest, lane, lanes)
 
 
 @func
@@ -441,16 +456,17 @@ def find_near_pairs(
         contacts: the list; its second and third number become the ends that both lists need.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    lanes = ti.static(lanes_of_pair())
-    parts = ti.static(parts_of_search())
-    threads = ti.static(lanes * parts)
+    lanes, of_piece = ti.static(on_gpu(LANES), on_gpu(LANES_OF_PIECE))
+    parts, of_vertex = ti.static(on_gpu(EDGE_PARTS), on_gpu(VERTEX_PARTS))
+    threads = ti.static(lanes * (1 + parts))
     holds = ti.cast(counters.found[2] == 0, ti.i32)
     count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[3]
     enclosing = searching = ti.min(count, 1) * workers
+    due_end = whole_warps(due_count * of_piece)  # then those of edges, in warps of their own
     looking = ti.min(due_count, 1) * workers
     if ti.static(runs_on_gpu()):
-        enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), 2 * count * threads
-        looking = 2 * due_count * lanes
+        enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), count * threads
+        looking = 2 * due_end
     if count > 0:
         lists.ends[2], lists.ends[3] = 0, 0
     begin_sharing(counters.taken, 0)
@@ -466,15 +482,16 @@ def find_near_pairs(
     begin_sharing(counters.taken, 1)
     for worker in range(searching):
         item = next_item(-1, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
-        while item < 2 * count * threads:
-            if item < count * threads:
-                p = met.expired[item // threads]
+        while item < count * threads:
+            thread = item - count * lanes
+            if thread < 0:
+                p = met.expired[item // lanes]
                 pair_vertices_with_triangles(
-                    p, item % threads, lanes, parts, met, boxes, surface, blocks, lists.triangles
+                    p, item % lanes, lanes, of_vertex, met, boxes, surface, blocks, lists.triangles
                 )
             else:
-                p = met.expired[item // threads - count]
-                pair_edges(p, item % threads, lanes, parts, met, boxes, blocks.edges, lists.edges)
+                p = met.expired[thread // (lanes * parts)]
+                pair_edges(p, thread % (lanes * parts), lanes, parts, met, boxes, blocks.edges, lists.edges)
             item = next_item(item, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
@@ -487,50 +504,32 @@ def find_near_pairs(
     short, short_edges = fits * lists.ends[2], fits * lists.ends[3]
     searching_again, looking_now = ti.min(short + short_edges, 1) * workers, fits * looking
     if ti.static(runs_on_gpu()):
-        searching_again = (short + short_edges) * threads
+        searching_again = short * lanes + short_edges * lanes * parts
     begin_sharing(counters.taken, 2)
     for worker in range(searching_again):
         item = next_item(-1, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
-        while item < (short + short_edges) * threads:
-            if item < short * threads:
-                p = lists.triangles.again[item // threads]
+        while item < short * lanes + short_edges * lanes * parts:
+            thread = item - short * lanes
+            if thread < 0:
+                p = lists.triangles.again[item // lanes]
                 pair_vertices_with_triangles(
-                    p, item % threads, lanes, parts, met, boxes, surface, blocks, lists.triangles
+                    p, item % lanes, lanes, of_vertex, met, boxes, surface, blocks, lists.triangles
                 )
             else:
-                p = lists.edges.again[item // threads - short]
-                pair_edges(p, item % threads, lanes, parts, met, boxes, blocks.edges, lists.edges)
+                p = lists.edges.again[thread // (lanes * parts)]
+                pair_edges(p, thread % (lanes * parts), lanes, parts, met, boxes, blocks.edges, lists.edges)
             item = next_item(item, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
     begin_sharing(counters.taken, 3)
     for worker in range(looking_now):
         item = next_item(-1, worker, counters.taken, 3, DUE_AT_A_TIME)
-        while item < 2 * due_count * lanes:
-            if item < due_count * lanes:
-                look_at_piece(
-                    met.due[item // lanes],
-                    item % lanes,
-                    lanes,
-                    lists.triangles,
-                    met,
-                    False,
-                    surface,
-                    rest,
-                    recovery,
-                    contacts,
-                )
+        while item < 2 * due_end:
+            place = item % due_end // of_piece
+            lane = ti.select(place < due_count, item % of_piece, NO_MORE)
+            p = met.due[ti.min(place, due_count - 1)]
+            if item < due_end:
+                look_at_piece(p, lane, of_piece, lists.triangles, met, False, surface, rest, recovery, contacts)
             else:
-                look_at_piece(
-                    met.due[item // lanes - due_count],
-                    item % lanes,
-                    lanes,
-                    lists.edges,
-                    met,
-                    True,
-                    surface,
-                    rest,
-                    recovery,
-                    contacts,
-                )
+                look_at_piece(p, lane, of_piece, lists.edges, met, True, surface, rest, recovery, contacts)
             item = next_item(item, worker, counters.taken, 3, DUE_AT_A_TIME)
     lists.ends[2], lists.ends[3] = lists.ends[2] - short, lists.ends[3] - short_edges
     contacts.counter[1], contacts.counter[2], contacts.counter[4] = lists.ends[0], lists.ends[1], holds * fits

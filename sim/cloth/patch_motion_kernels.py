@@ -23,6 +23,7 @@ from sim.cloth.bundles import (
 from sim.cloth.contact_response import thickness_between
 from sim.cloth.near_pairs import NEVER, SAFETY_OF_DUE
 from sim.cloth.proximity_contacts import EDGE_EDGE
+from sim.cloth.state import OVER, OVER_WITH_MORE
 from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
@@ -282,20 +283,22 @@ def pair_patches(
                     if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
                         slot = ti.atomic_add(counter[0], 1)
                         if slot < capacity:
-                            before = -1
-                            for place in range(known.first[2 * m], known.first[2 * m + 1]):
-                                if known.pairs[known.known[place]][1] == other:
-                                    before = known.known[place]
-                            now.pairs[slot], carried[slot] = ti.Vector([m, other]), before
-                            now.wake[slot], now.left[slot], now.approach[slot], now.allowed[slot] = -1.0, FAR, 0.0, 0.0
-                            now.slack[slot] = -1.0
-                            if before >= 0:
-                                now.slack[slot] = known.slack[before]
+                            now.pairs[slot] = ti.Vector([m, other])
                     # On to the next node that is not below this one; 0 after the last.
                     while node % 2 == 1:
                         node = node // 2
                     node += ti.cast(node > 0, ti.i32)
             m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+    end = ti.min(counter[0], capacity)
+    for p in range(end):
+        m, other, before = now.pairs[p][0], now.pairs[p][1], -1
+        for place in range(known.first[2 * m], known.first[2 * m + 1]):
+            if known.pairs[known.known[place]][1] == other:
+                before = known.known[place]
+        carried[p], now.slack[p] = before, -1.0
+        if before >= 0:
+            now.slack[p] = known.slack[before]
+        now.wake[p], now.left[p], now.approach[p], now.allowed[p] = -1.0, FAR, 0.0, 0.0
     return counter[0]
 
 
@@ -520,8 +523,8 @@ def end_contacts(
     workers: ti.math.ivec3,
     counters: Counters,
 ) -> ti.math.ivec3:
-    """Test `count` contacts (`repair_crossing`); if none failed, measure how far they displaced patches; if not farther
-    than allowed for, displacements are final: note where they lead, and what of the lists they use up.
+    """Test `count` contacts at most (`repair_crossing`); if none failed, measure how far they displaced patches; if not
+    farther than allowed for, displacements are final: note where they lead, and what of the lists they use up.
 
     Args:
         count, contacts, tested: see `repair_crossing`.
@@ -532,12 +535,16 @@ def end_contacts(
         counters: three numbers.
 
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
-    is not finite.
+    is not finite. Nothing is done, and farther is said, if the end `is_ahead` of rounds that are not over, of steps
+    that they lack, or of contacts that have no room.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end = count, vertex_count
-    displaced_end, patches_end, pairs_end = workers[0], workers[1], workers[2]
-    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
+    is_enough = end.rounds[0] == OVER and (end.counter[0] == 0 or end.counter[3] == 0)
+    is_over = (is_enough or end.rounds[0] == OVER_WITH_MORE) and contacts.counter[3] > 0
+    ends = ti.cast(end.is_ahead == 0 or is_over, ti.i32)
+    contacts_end, vertices_end = ends * ti.min(count, contacts.counter[3]), ends * vertex_count
+    displaced_end, patches_end, pairs_end = ends * workers[0], ends * workers[1], ends * workers[2]
+    counters.found[0], counters.found[1], counters.found[2] = 0, 1 - ends, 0
     for c in range(contacts_end):
         repair_crossing(c, contacts, tested, nodes, counters.found)
     begin_sharing(counters.taken, 0)

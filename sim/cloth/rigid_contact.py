@@ -19,7 +19,7 @@ from sim.cloth.bundles import (
     Walls,
     Weights,
 )
-from sim.cloth.near_pairs import lanes_of_pair
+from sim.cloth.near_pairs import LANES, on_gpu
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import closest_on_triangle, unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
@@ -80,6 +80,7 @@ class CollisionBodies(DeviceShapes):
             put(self.colliding.friction, friction)
 
 
+LANES_OF_VERTICES = 8  # threads of a GPU for a patch of which vertices alone are looked at
 PATCHES_AT_A_TIME = 4  # patches that a thread takes at a time: those that touch a body take some microseconds each
 
 LARGEST_ADVANCE = 0.25
@@ -288,7 +289,8 @@ class RigidContact:
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
-        lanes, is_alone = lanes_of_pair(), not (self._walls.count or self.bodies.count)
+        is_alone, shows = not (self._walls.count or self.bodies.count), self._shows.any()
+        lanes = on_gpu(LANES if shows else LANES_OF_VERTICES)
         return find_rigid_contacts.later(
             PatchLists(patches.vertex_lists, patches.elements),
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
@@ -297,7 +299,7 @@ class RigidContact:
             margin,
             self._largest_half,
             Touching(state.surface, state.inverse_mass, self._walls, self.bodies.colliding, recovery, contacts.found),
-            SHOWN_BODIES if self._shows.any() else BODIES if self.bodies.count else NO_BODIES,
+            SHOWN_BODIES if shows else BODIES if self.bodies.count else NO_BODIES,
         )
 
 

@@ -7,12 +7,14 @@ import taichi as ti
 
 from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
 from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
-from sim.cloth.state import ClothState
+from sim.cloth.parameters import MOST_TURNS
+from sim.cloth.state import GO_ON, OVER, ClothState
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func, with_room
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import LEAST_RUN
+from sim.core.warps import WARP, largest_in_warp, on_cuda, whole_warps
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be fixed. With fixed directions, waves
@@ -25,6 +27,11 @@ STRAIGHTENED = 0.35
 
 LEAST_WEIGHT = 1.0e-20  # inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions
 LEAST_ALIKE = 0.995  # cosine of the angle that a spring may turn by in a step for its direction to be that of the start
+
+RELAXED_BEYOND = float(np.float32(0.03))
+"""Excess of a spring [rest lengths] beyond which springs and contacts take another turn."""
+
+NO_TURN = -1
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -63,12 +70,16 @@ class ThreadSolver:
         while self._rows < np.diff(starts).max(initial=0) + 1:
             self._rows *= 2
 
-    def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
-        """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
+    def displace(self, state: ClothState, dt: float, *, is_first: bool, is_ahead: bool = False) -> None:
+        """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0.
+
+        If `is_ahead`, only where `ClothState.rounds` go on, of which the host does not know yet.
+        """
         springs, nodes, step = self.springs, state.nodes, self.springs.first_colours.step
         springs.contract(nodes, state.displacement)
         for colour in springs.first_colours:
-            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, self._rows, step)
+            ahead = state.rounds, int(is_ahead)
+            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, *ahead, self._rows, step)
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for fixed directions.
@@ -81,13 +92,15 @@ class ThreadSolver:
         for colour in springs.first_colours:
             straighten_threads(springs.on_device, colour, state.nodes, dt, self._work, self._rows, step)
 
-    def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
-        """Asks for the largest excess of a spring [rest lengths], and how many have not converged
-        (`excess_of`).
+    def excess(self, state: ClothState, dt: float, turn: int = NO_TURN) -> Callable[[], tuple[float, float, float]]:
+        """Asks for the largest excess of a spring [rest lengths], and how many have not converged (`excess_of`); and
+        how many turns springs had taken then.
+
+        If a `turn` is numbered, that decides whether `ClothState.rounds` go on; where they do not, nothing is measured.
         """
-        springs = self.springs
+        springs, rounds = self.springs, (state.rounds, turn, MOST_TURNS, RELAXED_BEYOND)
         return measure_excess.later(
-            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found
+            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found, *rounds
         )
 
 
@@ -247,6 +260,8 @@ def solve_threads(
     dt: ti.f32,
     is_first: ti.i32,
     work: ThreadWork,
+    rounds: Integers,
+    is_ahead: ti.i32,
     rows: ti.template(),
     colours: ti.template(),
 ):
@@ -256,8 +271,10 @@ def solve_threads(
 
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
+    Nothing is done if it `is_ahead` of `rounds` that do not go on.
     """
-    threads = ti.static(rows if runs_on_gpu() else 1)
+    goes_on = ti.cast(is_ahead == 0 or rounds[0] == GO_ON, ti.i32)
+    threads = goes_on * ti.static(rows if runs_on_gpu() else 1)
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
@@ -268,17 +285,30 @@ def solve_threads(
                 one, two = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 three, of_x = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
                 of_y, of_z = ti.simt.block.SharedArray((rows,), ti.f32), ti.simt.block.SharedArray((rows,), ti.f32)
-                i, j, w_i, w_j, n, length, compliance, before = 0, 0, 0.0, 0.0, ti.math.vec3(0.0), 1.0, 0.0, 0.0
+                at_x, at_y = ti.simt.block.SharedArray((rows,), ti.i32), ti.simt.block.SharedArray((rows,), ti.i32)
+                at_z = ti.simt.block.SharedArray((rows,), ti.i32)
+                # Nodes of columns are far from each other in memory: each is read once, by the thread of its place.
+                i, w_i, u, x = -1, 0.0, ti.math.vec3(0.0), ti.math.ivec3(0)
                 if k < count:
-                    i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-                    w_i, w_j = nodes.inverse_mass[i], nodes.inverse_mass[j]
-                    at_start = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
-                    d = at_start + (nodes.displacement[i] - nodes.displacement[j])
+                    i = springs.nodes[2 * s]
+                elif k == count:
+                    i = springs.nodes[2 * s - 1]
+                if i >= 0:
+                    w_i, u, x = nodes.inverse_mass[i], nodes.displacement[i], nodes.lattice[i]
+                one[k], of_x[k], of_y[k], of_z[k] = w_i, u.x, u.y, u.z
+                at_x[k], at_y[k], at_z[k] = x.x, x.y, x.z
+                ti.simt.block.sync()
+                w_j, n, length, compliance, before = 0.0, ti.math.vec3(0.0), 1.0, 0.0, 0.0
+                if k < count:
+                    w_j = one[k + 1]
+                    at_start = nodes.quantum * ti.cast(x - ti.math.ivec3(at_x[k + 1], at_y[k + 1], at_z[k + 1]), ti.f32)
+                    d = at_start + (u - ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1]))
                     length = ti.max(d.norm(), TINY_LENGTH)
                     n = direction_of(at_start, d / length)
                     compliance = 1.0 / (springs.law[s][1] * dt * dt)
                     if not is_first:
                         before = work.multiplier[s]
+                ti.simt.block.sync()
                 of_x[k], of_y[k], of_z[k] = n.x, n.y, n.z
                 if k == 0:
                     work.is_taut[p] = 0
@@ -303,13 +333,14 @@ def solve_threads(
                 push = change * n
                 of_x[k], of_y[k], of_z[k] = push.x, push.y, push.z
                 ti.simt.block.sync()
+                if i >= 0:
+                    moved = ti.math.vec3(0.0)
+                    if k < count:
+                        moved = push
+                    if k > 0:
+                        moved -= ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1])
+                    nodes.displacement[i] = u + w_i * moved
                 if k < count:
-                    moved = -push  # of the node that the spring leads to, which the next one leads from
-                    if k + 1 < count:
-                        moved += ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1])
-                    nodes.displacement[j] = nodes.displacement[j] + w_j * moved
-                    if k == 0:
-                        nodes.displacement[i] = nodes.displacement[i] + w_i * push
                     work.multiplier[s] = before + change
                     work.tension[s] = tension_to_turn(-(before + change) / length, w_i + w_j)
                     if work.tension[s] > 0.0:
@@ -399,19 +430,42 @@ def excess_of(
 
 @kernel
 def measure_excess(
-    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
-) -> ti.math.vec2:
-    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
-    end = count
-    found[0], found[1] = 0, 0
-    for s in range(end):
-        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        excess = excess_of(
-            i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
-        )
-        bits = ti.bit_cast(excess, ti.i32)  # those of numbers from 0 on are in their order
-        if excess > 0.0 and bits > found[0]:  # all others would wait in line to change nothing
-            ti.atomic_max(found[0], bits)
+    springs: SpringArrays,
+    count: ti.i32,
+    multiplier: Floats,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+    found: Integers,
+    rounds: Integers,
+    turn: ti.i32,
+    most_turns: ti.i32,
+    limit: ti.f32,
+) -> ti.math.vec3:
+    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`.
+
+    Before a `turn`, a number from 0 on, `rounds` go on if contacts push and the excess is above a limit, up to the
+    `most_turns`; if they did not before, what was found stays. Returns also how many turns have been taken.
+    """
+    is_asked = turn == NO_TURN or rounds[0] == GO_ON
+    end = ti.select(is_asked, count, 0)
+    whole_end = whole_warps(end)
+    if is_asked:
+        found[0], found[1] = 0, 0
+    for s in range(whole_end):
+        excess = 0.0
+        if s < end:
+            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+            excess = excess_of(
+                i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
+            )
+        # Bits of numbers from 0 on are in their order.
+        largest = largest_in_warp(ti.bit_cast(ti.select(excess > 0.0, excess, 0.0), ti.i32))
+        if largest > found[0] and (ti.static(not on_cuda()) or s % WARP == 0):  # others would wait to change nothing
+            ti.atomic_max(found[0], largest)
         if excess > LARGEST_RESIDUAL:
             ti.atomic_add(found[1], 1)
-    return ti.math.vec2(ti.bit_cast(found[0], ti.f32), ti.cast(found[1], ti.f32))
+    largest = ti.bit_cast(found[0], ti.f32)
+    if turn != NO_TURN and rounds[0] == GO_ON:
+        rounds[0] = ti.select(largest > limit and turn < most_turns and rounds[2] > 0, GO_ON, OVER)
+        rounds[1] = turn
+    return ti.math.vec3(largest, ti.cast(found[1], ti.f32), ti.cast(rounds[1], ti.f32))

@@ -28,12 +28,12 @@ def whole_warps(count: ti.i32) -> ti.i32:
 
 
 @ti.func
-def raise_to(values: Floats, place: ti.i32, least: ti.f32, lane: ti.i32):
-    """Let a value be this at least; all threads of a warp name the same place."""
+def raise_to(values: Floats, place: ti.i32, least: ti.f32, lane: ti.i32, lanes: ti.template()):
+    """Let a value be this at least; so many neighbouring threads of a warp, a power of two, name the same place."""
     if ti.static(on_cuda()):
-        for step in ti.static((16, 8, 4, 2, 1)):
+        for step in ti.static([step for step in (16, 8, 4, 2, 1) if step < lanes]):
             least = ti.max(least, ti.simt.warp.shfl_down_f32(ti.u32(0xFFFFFFFF), least, step))
-        if lane % WARP == 0 and least > values[place]:
+        if lane % lanes == 0 and least > values[place]:
             ti.atomic_max(values[place], least)
     elif least > values[place]:
         ti.atomic_max(values[place], least)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth import threads
@@ -31,6 +32,8 @@ def solve_threads(
     dt: float,
     is_first: int,
     work: ThreadWork,
+    _rounds: ti.Ndarray,
+    _is_ahead: int,
     _rows: int,
     colours: int,
 ) -> None:

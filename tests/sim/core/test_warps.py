@@ -14,7 +14,7 @@ def gather(values: Floats, kinds: Integers, count: ti.i32, sums: LongIntegers, l
         value, kind = -1.0e30, -1
         if i < count:
             value, kind = values[i], kinds[i]
-        raise_to(largest, i // WARP, value, i)
+        raise_to(largest, i // WARP, value, i, WARP)
         common = largest_in_warp(kind)
         add_to(sums, common, ti.select(i < count, ti.round(value, ti.i64), ti.cast(0, ti.i64)), i)
 
