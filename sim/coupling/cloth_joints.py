@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
+from sim.cloth.parameters import ClothParameters, substeps_of
 from sim.core.host_access import copied, put_rows, viewed
 from sim.core.parameters import Vector3
 from sim.core.solver import Coupling
@@ -69,8 +69,11 @@ def off_cloth(
     )
 
 
-def eyelet_mass(cloth: ClothParameters, node_area: float, dt: float) -> float:
-    """Mass of an eyelet at a node with such a share of the area [m²], for substeps of dt [s] [kg]."""
+def eyelet_mass(
+    cloth: ClothParameters, node_area: float, frames_per_second: float, cloths: Sequence[ClothParameters]
+) -> float:
+    """Mass of an eyelet at a node with such a share of the area of one of the cloths of a scene [m²] [kg]."""
+    dt = 1.0 / (frames_per_second * substeps_of(cloths))
     impedance = math.sqrt(cloth.plane_stiffness * cloth.mass_per_area * node_area)
     return EYELET_IN_IMPEDANCES * dt * impedance
 
@@ -204,9 +207,10 @@ def points_of_joints(
     numbers = np.full((len(joints), 2), -1)
     for (number, end), point in zip(ends, of_end.tolist(), strict=True):
         numbers[number, end] = point
-    steps = max((each.substeps or DEFAULT_SUBSTEPS for each in parameters), default=DEFAULT_SUBSTEPS)
-    dt = 1.0 / (frames_per_second * steps)
-    eyelets = [eyelet_mass(parameters[int(host.body[node])], float(host.node_area[node]), dt) for node in nodes]
+    eyelets = [
+        eyelet_mass(parameters[int(host.body[node])], float(host.node_area[node]), frames_per_second, parameters)
+        for node in nodes
+    ]
     cloth.put_eyelets(nodes, np.array(eyelets))
     mass = copied(cloth.state.mass)[nodes].astype(np.float64)
     return nodes, JointPoints(numbers, host.position[nodes], host.velocity[nodes].astype(np.float64), mass)

@@ -11,7 +11,7 @@ from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
 from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over, note_gaps
 from pipeline.kinds.checks.cloth_start import ClothStart, start_cloths
-from pipeline.kinds.checks.joints import check_joints_of_cloth
+from pipeline.kinds.checks.joints import check_joints_of_cloth, joined_to
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.pins import check_pin_load, check_pin_speeds, check_pin_times
 from pipeline.model.amounts import count
@@ -60,7 +60,8 @@ def check_cloths(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         check_pin_load(start, job, fluid_over(job, solids, start.box), findings)
         check_buoyancy(job, start.path, start.cloth, findings)
         note_gaps(job, start.path, start.cloth, findings)
-        joined = check_joints_of_cloth(start, job, findings)
+        check_joints_of_cloth(start, job, findings)
+        joined = joined_to(start.cloth, job)
         for path, solid in solids.items():
             if path[0] == "rigid" and job.rigid[int(path[1])].name not in joined:
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
