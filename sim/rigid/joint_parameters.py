@@ -256,15 +256,14 @@ def _problems_with_cloth(
     cloths: Sequence[str],
     bodies: Sequence[RigidBodyParameters],
 ) -> Iterator[JointProblem]:
-    """Of a joint that names cloths: one end is a body that moves, and a point of cloth has no directions."""
-    standing = [name for name in joint.between if kinds.get(name) == "static"]
+    """Of a joint that names cloths: one end is a dynamic body, and a point of cloth has no directions."""
+    led = [name for name in joint.between if kinds.get(name, "dynamic") != "dynamic"]
     if len(cloths) == 2:
         yield JointProblem(number, "between", f'joins the cloths "{cloths[0]}" and "{cloths[1]}"; join both to a body')
-    elif len(joint.between) == 1 or standing:
-        other = f'"{standing[0]}", which is static' if standing else "the world"
-        yield JointProblem(
-            number, "between", f'joins the cloth "{cloths[0]}" to {other}; hold it there by a [[cloth.pin]]'
-        )
+    elif len(joint.between) == 1 or led:
+        other = f'"{led[0]}", which is {kinds[led[0]]}' if led else "the world"
+        pin = "[[cloth.pin]] with such keyframes" if led and kinds[led[0]] == "kinematic" else "[[cloth.pin]]"
+        yield JointProblem(number, "between", f'joins the cloth "{cloths[0]}" to {other}; hold it there by a {pin}')
     elif joint.kind in RIGID_KINDS and joint.kind != "ball":
         yield JointProblem(
             number, "kind", f'is a {joint.kind} at the cloth "{cloths[0]}", a point of which has no directions; use a '

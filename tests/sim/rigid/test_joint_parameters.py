@@ -140,6 +140,10 @@ AT_CLOTH = {
         {"between": ("post", "sail"), "kind": "rope", "anchors": (POINT, POINT)},
         'joins the cloth "sail" to "post", which is static',
     ),
+    "kinematic body": (
+        {"between": ("hand", "sail"), "kind": "ball", "anchor": POINT},
+        'to "hand", which is kinematic; hold it there by a [[cloth.pin]] with such keyframes',
+    ),
     "two cloths": (
         {"between": ("jib", "sail"), "kind": "rope", "anchors": (POINT, POINT)},
         'joins the cloths "jib" and "sail"; join both to a body',
@@ -174,6 +178,6 @@ def test_what_makes_sense_is_taken():
         JointParameters(name="led", between=("a", "hand"), kind="slider", axis=AXIS, limits=(0, 2)),
         JointParameters(name="stands", between=("b", "post"), kind="fixed"),
         JointParameters(name="hook", between=("b", "sail"), kind="ball", anchor=POINT),
-        JointParameters(name="sheet", between=("sail", "hand"), kind="rope", anchors=(POINT, (3, 0, 1))),
+        JointParameters(name="sheet", between=("sail", "a"), kind="rope", anchors=((3, 0, 1), POINT)),
     ]
     assert not list(joint_problems(joints, BODIES, ("sail",)))
