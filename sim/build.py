@@ -13,6 +13,7 @@ from sim.core.solver import Coupling, Solver
 from sim.core.world import World
 from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
 from sim.coupling.cloth_fluid import ClothFluidCoupling, ClothSamples
+from sim.coupling.cloth_joints import ClothJointsCoupling, passing_of, points_of_joints
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
 from sim.coupling.emitter_bodies import with_emitters_on
 from sim.coupling.fluid_rigid import FluidRigidCoupling, samples_of_moving_bodies
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
     from sim.fluid.fluid import SPHFluid
     from sim.fluid.parameters import FluidParameters
+    from sim.rigid.joint_points import JointPoints
     from sim.rigid.parameters import RigidBodyParameters
     from sim.scene import SceneParameters
     from sim.shapes.solid import Solid
@@ -64,7 +66,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     forces = ForceField(scene.force) if scene.force else None
     shapes = SharedShapes()
     static = [StaticBody(parameters, shapes) for parameters in scene.rigid if parameters.kind == "static"]
-    rigid = _build_rigid(scene, forces)
+    _refuse_joints(scene)
     cloths = []
     if scene.cloth:  # one solver for all, as they collide with each other
         solver = ClothSolver(
@@ -75,6 +77,9 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
             forces=forces,
         )
         cloths = [solver]
+    sewn = any(cloth.name in joint.between for joint in scene.joint for cloth in scene.cloth)
+    nodes, points = points_of_joints(scene.joint, cloths[0], frames_per_second) if sewn else (None, None)
+    rigid = _build_rigid(scene, points, forces)
     samples = None
     if cloths and scene.fluid:
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
@@ -83,9 +88,13 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     coupled: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
-        contacts = contacts_of_cloths(cloth, scene.rigid, domain=scene.domain, rigid=rigid)
+        names = [body.name for kind in (True, False) for body in scene.rigid if (body.kind != "static") == kind]
+        passing = passing_of(scene.joint, scene.cloth, names)
+        contacts = contacts_of_cloths(cloth, scene.rigid, domain=scene.domain, rigid=rigid, passing=passing.any(axis=0))
         cloth.contacts = contacts
         couplings += [] if rigid is None else [ClothRigidCoupling(cloth, rigid, contacts)]
+        if rigid is not None and nodes is not None:
+            couplings.append(ClothJointsCoupling(cloth, rigid, nodes, passing))
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
     standing = {body.name: body.snapshot() for body in static}
@@ -189,14 +198,18 @@ def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: f
     return samples[inside.all(axis=1)]
 
 
-def _build_rigid(scene: SceneParameters, forces: ForceField | None) -> RigidSolver | None:
-    """The solver of the bodies that move, if there are any."""
+def _refuse_joints(scene: SceneParameters) -> None:
+    """Refuse joints that cannot be."""
     problems = [
         f'joint "{scene.joint[each.number].name}": {each.text}'
         for each in joint_problems(scene.joint, scene.rigid, [cloth.name for cloth in scene.cloth])
     ]
     if problems:
         raise ValueError("; ".join(problems))
+
+
+def _build_rigid(scene: SceneParameters, points: JointPoints | None, forces: ForceField | None) -> RigidSolver | None:
+    """The solver of the bodies that move, if there are any, with points of cloths that joints hold."""
     moving = [body for body in scene.rigid if body.kind != "static"]
     if not moving:
         return None
@@ -205,6 +218,7 @@ def _build_rigid(scene: SceneParameters, forces: ForceField | None) -> RigidSolv
         moving,
         obstacles=obstacles,
         joints=scene.joint,
+        points=points,
         domain=scene.domain,
         gravity=scene.gravity,
         forces=forces,

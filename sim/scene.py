@@ -25,7 +25,9 @@ class SceneParameters(Parameters):
     rigid: Annotated[tuple[RigidBodyParameters, ...], AfterValidator(with_groups)] = Field(
         default=(), description="Rigid bodies; a table with count makes many."
     )
-    joint: tuple[JointParameters, ...] = Field(default=(), description="Joints between rigid bodies, or to the world.")
+    joint: tuple[JointParameters, ...] = Field(
+        default=(), description="Joints between rigid bodies, to the world, or to points of cloths."
+    )
     fluid: tuple[FluidParameters, ...] = Field(
         default=(), description="Particle fluids; several share one tank, and the keys that say how it is computed."
     )

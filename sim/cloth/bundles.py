@@ -510,6 +510,7 @@ class CollidingBodies(NamedTuple):
     radius: Floats  # [m]
     step: Floats  # [m]
     friction: Floats  # [-]
+    passes: Integers  # 1 where cloth c passes through body b by a joint, at c times their number + b
     lift: Floats  # how much farther than half a thickness vertices keep [m]
     position: Vectors  # centre of mass at the start of the substep [m]
     rotation: Matrices  # body axes to world axes
@@ -535,6 +536,7 @@ class Touching(NamedTuple):
 
     surface: Surface
     inverse_mass: Floats  # of nodes [1/kg], (n,)
+    cloth: Integers  # of nodes, (n,)
     walls: Walls
     bodies: CollidingBodies
     recovery: ti.f32  # share of a missing distance that the substep gives back [-]

@@ -53,15 +53,22 @@ class CollisionBodies(DeviceShapes):
     Args:
         geometries: of the bodies.
         friction: Coulomb's coefficients [-], (b,).
+        cloths: number of cloths.
     """
 
-    def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float]) -> None:
+    def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float], cloths: int = 1) -> None:
         super().__init__(geometries)
         b = self.count
         known = {name: getattr(self, name) for name in ("centre_of_mass", "radius", "step")}
         motion = ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1))
         self.colliding: CollidingBodies = with_room(
-            CollidingBodies, b, count=b, shapes=self.on_device, motion=motion, **known
+            CollidingBodies,
+            b,
+            count=b,
+            shapes=self.on_device,
+            motion=motion,
+            passes=ti.ndarray(ti.i32, max(b * cloths, 1)),
+            **known,
         )
         twice = {name: ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1)) for name in ("motion_start", "motion_reached")}
         six = {name: ti.ndarray(ti.i64, 6 * max(b, 1)) for name in ("gathered", "impulse")}
@@ -69,6 +76,11 @@ class CollisionBodies(DeviceShapes):
             PushedBodies, b, may_move=0, count=b, motion=motion, load_unit=1.0, **twice, **six
         )
         self.set_friction(np.asarray(friction, dtype=np.float64))
+
+    def set_passing(self, passing: NDArray[np.bool_]) -> None:
+        """Say which cloths pass through which bodies, (cloths, b)."""
+        if self.count:
+            put(self.colliding.passes, passing.ravel())
 
     def begin_frame(self) -> None:
         """Note anew how deep cloth gets."""
@@ -147,10 +159,13 @@ class RigidContact:
         geometries: of the bodies; those that move first.
         friction: of the bodies [-]; cloth and body have the geometric mean.
         walls: closed faces of the domain, which have the friction of the cloth.
+        cloths: number of cloths.
     """
 
-    def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float], walls: Sequence[Wall]) -> None:
-        self.bodies = CollisionBodies(geometries, friction)
+    def __init__(
+        self, geometries: Sequence[BodyGeometry], friction: Sequence[float], walls: Sequence[Wall], cloths: int = 1
+    ) -> None:
+        self.bodies = CollisionBodies(geometries, friction, cloths)
         self._motion: BodyMotion | None = None
         self._time_s = 0.0
         self._advance = LARGEST_ADVANCE * 0.5 * np.array([geometry.shortest_edge for geometry in geometries])
@@ -298,7 +313,15 @@ class RigidContact:
             motion,
             margin,
             self._largest_half,
-            Touching(state.surface, state.inverse_mass, self._walls, self.bodies.colliding, recovery, contacts.found),
+            Touching(
+                state.surface,
+                state.inverse_mass,
+                state.body,
+                self._walls,
+                self.bodies.colliding,
+                recovery,
+                contacts.found,
+            ),
             SHOWN_BODIES if shows else BODIES if self.bodies.count else NO_BODIES,
         )
 
@@ -515,7 +538,8 @@ def find_rigid_contacts(
                     half, weight = 0.5 * surface.thickness[i], ti.math.vec4(1.0, 0.0, 0.0, 0.0)
                     noted, across = ti.select(near.inverse_mass[i] > 0.0, half, 0.0), ti.Matrix.identity(ti.f32, 3)
                     for b in range(bodies.count):
-                        touch_body(b, Four(i), weight, half + bodies.lift[b], across, noted, allowed, near)
+                        if bodies.passes[near.cloth[i] * bodies.count + b] == 0:
+                            touch_body(b, Four(i), weight, half + bodies.lift[b], across, noted, allowed, near)
                     place += lanes
                 if ti.static(meets == SHOWN_BODIES):
                     # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
@@ -530,7 +554,8 @@ def find_rigid_contacts(
                         else:
                             corners = elements.triangles[elements.first_triangle[m] + place - edges]
                         for b in range(bodies.count):
-                            if bodies.shows[b] > ti.cast(place < edges, ti.i32):
+                            passes = bodies.passes[near.cloth[corners[0]] * bodies.count + b] == 1
+                            if bodies.shows[b] > ti.cast(place < edges, ti.i32) and not passes:
                                 touch_triangle(b, corners, allowed, near)
                         place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)

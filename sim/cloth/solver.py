@@ -27,7 +27,7 @@ from sim.cloth.pins import Pins
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
-from sim.cloth.state import ClothState, HostCloths, NodeLoad, finish_step
+from sim.cloth.state import ClothState, HostCloths, Load, finish_step
 from sim.cloth.threads import NO_TURN, RELAXED_BEYOND
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
@@ -118,7 +118,7 @@ class ClothSolver:
         parameters: of the cloths, as they are now.
         gravity: [m/s²]; may be changed between frames.
         contacts: of the cloths with each other, bodies and walls; None where they pass through all.
-        load: what a coupling lays onto the nodes in every substep, if any does.
+        loads: what couplings lay onto the nodes in every substep.
         air: at every triangle, the wind unless a coupling puts other air there.
         warnings: what was repaired in meshes, a sentence each.
 
@@ -159,7 +159,7 @@ class ClothSolver:
         self.state = ClothState(host, reach=reach)
         self.gravity = gravity
         self.contacts: ContinuousContacts | None = None
-        self.load: NodeLoad | None = None
+        self.loads: list[Load] = []
         shared = self.parameters[0]
         first_nodes = host.first_node.tolist()
         groups = [(cloth.iterations or 0, cloth.substeps is None) for cloth in self.parameters]
@@ -236,6 +236,11 @@ class ClothSolver:
         self._pins.let_go(self._nodes_of(name, nodes))
         self._hold_pins()
 
+    def put_eyelets(self, nodes: NDArray[np.int64], mass: NDArray[np.float64]) -> None:
+        """Let nodes, by their numbers in the scene, weigh so much more [kg], (h,), for good."""
+        self.state.eyelets[nodes] += mass
+        self._change_to(self.parameters)
+
     def _nodes_of(self, name: str, nodes: Sequence[int]) -> NDArray[np.int64]:
         """Numbers of a cloth's nodes in the scene."""
         if name not in self.state.names:
@@ -277,8 +282,8 @@ class ClothSolver:
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         self._hold_pins()
-        if self.load is not None:
-            self.load.put_on(self.state, self.gravity, dt)
+        for load in self.loads:
+            load.put_on(self.state, self.gravity, dt)
         if self._forces.accelerates:
             push_nodes(self.state.nodes, self.state.position, self.state.body, self._forces.now, dt)
         if self._forces.blows and self.air.acts:
@@ -287,8 +292,8 @@ class ClothSolver:
         self.air.predict(self.gravity, dt)
         self._pins.displace(self._time_s, dt)
         self._displace(dt)
-        if self.load is not None:
-            self.load.take_off(self.state)
+        for load in reversed(self.loads):
+            load.take_off(self.state)
         self._time_s += dt
 
     def _displace(self, dt: float) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -14,7 +15,7 @@ from sim.cloth.springs import Edges, edges_of
 from sim.cloth.start import quantum_of, start_positions
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import with_room
-from sim.core.host_access import copied
+from sim.core.host_access import copied, viewed
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
@@ -105,6 +106,7 @@ class ClothState:
         names: of the cloths.
         self_collision: of each cloth: whether it collides with itself.
         is_free: of each cloth: whether it is one piece, and no pin holds any of its nodes.
+        eyelets: what nodes weigh besides their share of the sheet [kg], (n,).
         quantum: unit of the lattice [m].
         limit: end of the lattice on each axis, in quanta; nodes that come there are stopped.
         rounds: of contacts in a substep, on the device: whether they `GO_ON`, so that springs take another turn; how
@@ -135,6 +137,7 @@ class ClothState:
             on_device(host.triangles),
             on_device(host.edges.nodes),
         )
+        self.eyelets = np.zeros(n)
         self.self_collision: tuple[bool, ...] = ()
         self.is_free: tuple[bool, ...] = ()
         self.set_positions(host.position)
@@ -168,6 +171,11 @@ class ClothState:
         positions: NDArray[np.float64] = copied(self.lattice) * self.quantum + copied(self.carry)
         return positions
 
+    def positions_of(self, nodes: NDArray[np.int64]) -> NDArray[np.float64]:
+        """World positions of some nodes [m], (h, 3) float64."""
+        positions: NDArray[np.float64] = viewed(self.lattice)[nodes] * self.quantum + viewed(self.carry)[nodes]
+        return positions
+
     def place_displaced(self) -> None:
         """Follow the lattice with what is derived from it: float32 positions, and displacements of nothing yet."""
         round_positions(self.nodes, self.position)
@@ -175,6 +183,7 @@ class ClothState:
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take mass, thickness, friction and whether they collide with themselves from the cloths' parameters."""
         mass = self.host.node_area * self.host.of_nodes([cloth.mass_per_area for cloth in cloths])
+        mass += self.eyelets
         self.mass.from_numpy(mass.astype(np.float32))
         self.thickness.from_numpy(self.host.of_nodes([cloth.thickness for cloth in cloths]).astype(np.float32))
         self.friction.from_numpy(self.host.of_nodes([cloth.friction for cloth in cloths]).astype(np.float32))
@@ -247,6 +256,16 @@ def finish_step(nodes: Nodes, position: Vectors, limit: ti.i32, dt: ti.f32, reas
                 nodes.carry[i][axis] = rest
         nodes.velocity[i] = v_i
         nodes.displacement[i] = nodes.carry[i]
+
+
+class Load(Protocol):
+    """What changes masses and velocities of nodes for a substep."""
+
+    def put_on(self, state: ClothState, gravity: Vector3, dt: float) -> None:
+        """Right before a substep of dt [s] under gravity [m/s²]."""
+
+    def take_off(self, state: ClothState) -> None:
+        """Right after it."""
 
 
 class NodeLoad:

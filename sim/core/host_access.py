@@ -55,6 +55,14 @@ def viewed(array: ti.Ndarray) -> NDArray[np.generic]:
     return copied(array) if runs_on_gpu() else _memory(array)
 
 
+def put_rows(array: ti.Ndarray, rows: NDArray[np.integer], new: NDArray[np.floating]) -> None:
+    """Put numbers into rows of an array."""
+    values = viewed(array)
+    values[rows] = new
+    if runs_on_gpu():
+        put(array, values)
+
+
 def add(array: ti.Ndarray, rows: slice | NDArray[np.integer], change: NDArray[np.floating]) -> None:
     """Add to rows of an array."""
     values = viewed(array)

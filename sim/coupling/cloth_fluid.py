@@ -161,7 +161,7 @@ class ClothFluidCoupling(Coupling):
         self._change = ti.Vector.ndarray(3, ti.f32, count)
         self._reduction = LaneReduction(maxima=MAXIMA, sums=0)
         self._load = NodeLoad(node_count)
-        cloth.load = self._load
+        cloth.loads.append(self._load)
         self.follow(0.0)
 
     def impulse(self) -> NDArray[np.float64]:

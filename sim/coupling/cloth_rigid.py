@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
 from sim.core.motion import rotation
@@ -75,8 +76,11 @@ def contacts_of_cloths(
     *,
     domain: DomainParameters,
     rigid: RigidSolver | None = None,
+    passing: NDArray[np.bool_] | None = None,
 ) -> ContinuousContacts:
     """The contacts of all cloths with themselves, with all rigid bodies and with walls.
+
+    Joints may let some pass through each other, (cloths, b).
 
     Raises:
         ValueError: a cloth starts inside a body.
@@ -88,11 +92,12 @@ def contacts_of_cloths(
     moving = [body for body in bodies if body.kind != "static"]
     geometries = [BodyGeometry(body) for body in static] if rigid is None else rigid.all_geometries
     walls = walls_of(domain)
-    contact = RigidContact(geometries, [body.friction for body in (*moving, *static)], walls)
+    contact = RigidContact(geometries, [body.friction for body in (*moving, *static)], walls, len(cloth.parameters))
     poses = _poses_of_static_bodies(static, geometries) if rigid is None else rigid.poses()
     contact.place(poses)
     names = [body.name for body in (*moving, *static)]
-    _refuse_start_inside(cloth.state, names, geometries, poses)
+    passing = np.zeros((len(cloth.parameters), len(names)), dtype=bool) if passing is None else passing
+    _refuse_start_inside(cloth.state, names, geometries, poses, passing)
     return ContinuousContacts(cloth.state, rigid=contact)
 
 
@@ -106,7 +111,11 @@ def _poses_of_static_bodies(bodies: Sequence[RigidBodyParameters], geometries: S
 
 
 def _refuse_start_inside(
-    state: ClothState, names: Sequence[str], geometries: Sequence[BodyGeometry], poses: Poses
+    state: ClothState,
+    names: Sequence[str],
+    geometries: Sequence[BodyGeometry],
+    poses: Poses,
+    passing: NDArray[np.bool_],
 ) -> None:
     """Refuse cloth that starts in a body: it would be pulled out through the nearest side, be it the wrong one.
 
@@ -116,7 +125,8 @@ def _refuse_start_inside(
     for number, (name, geometry) in enumerate(zip(names, geometries, strict=True)):
         relative = (positions - poses.position[number]) @ poses.rotation[number]
         low, high = geometry.bounds
-        near = np.flatnonzero(is_free & np.all((relative > low) & (relative < high), axis=1))
+        meets = is_free & ~passing[state.host.body, number]
+        near = np.flatnonzero(meets & np.all((relative > low) & (relative < high), axis=1))
         distance = geometry.signed_distance(relative[near])
         if len(near) and distance.min() < -ROUND_OFF:
             inside, deepest = np.count_nonzero(distance < -ROUND_OFF), near[int(np.argmin(distance))]

@@ -27,6 +27,7 @@ from sim.rigid.contact_solver import (
     solve_velocities,
 )
 from sim.rigid.contacts import Array, Contacts, Indices
+from sim.rigid.joint_points import no_points
 from sim.rigid.joint_system import JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
 from sim.rigid.parts import PartsDetector
@@ -114,11 +115,16 @@ class ContactResponse:
         contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
         led = NOT_CARRIED if carried is None else carried(contacts)
+        points = no_points(0) if joints is None else joints.points
+        ends = n + 1 + len(points)  # of bodies that no surface carries
+        ease = np.concatenate([ease, np.zeros((len(points), 7))])
+        ease[n + 1 :, 0] = points.inverse_mass
         system = ContactSystem.build(contacts, bodies.position, ease, links, led)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         least_normal = -np.maximum(contacts.gap, 0.0) / dt
         before = np.zeros((len(system.ease), 6))
-        before[:n, :3], before[:n, 3:], before[n + 1 :, :3] = bodies.velocity, bodies.angular_velocity, led.velocity
+        before[:n, :3], before[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        before[n + 1 : ends, :3], before[ends:, :3] = points.velocity, led.velocity
         of_impacts, of_step, by_joints = None, None, NO_IMPULSES
         if joints is not None and step is not None:
             of_impacts, of_step = joints.impacts(step), joints.velocities(step)
@@ -140,6 +146,7 @@ class ContactResponse:
             apart=_separation(contacts, bounces, dt),
         )
         bodies.velocity, bodies.angular_velocity = solution.velocity[:n, :3].copy(), solution.velocity[:n, 3:].copy()
+        points.velocity = solution.velocity[n + 1 : ends, :3].copy()
 
         touched, held = np.zeros(len(system.ease), dtype=bool), np.zeros(len(system.ease), dtype=bool)
         pushed = solution.impulses[:, 0] != 0.0

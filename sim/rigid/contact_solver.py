@@ -44,10 +44,10 @@ class ContactSystem:
     point: Array  # [m], (k, 3)
     normal: Array  # from the second to the first, (k, 3)
     bodies: NDArray[np.int32]  # numbers of the two bodies, n where one does not belong to those that move, (k, 2)
-    position: Array  # of the moving bodies, of one that stands still, and of c that surfaces carry [m], (n + 1 + c, 3)
-    ease: Array  # of these, inverse mass and inertia: xx, xy, xz, yy, yz, zz, (n + 1 + c, 7)
+    position: Array  # of the moving bodies, one that stands still, points, and c that surfaces carry [m], (b, 3)
+    ease: Array  # of these, inverse mass and inertia: xx, xy, xz, yy, yz, zz, (b, 7)
     islands: Indices  # numbers of the groups of contacts that hang together, (k,)
-    island_of_bodies: Indices  # likewise of bodies, -1 of those that no contact, or no impulse, moves, (n + 1 + c,)
+    island_of_bodies: Indices  # likewise of bodies, -1 of those that no contact, or no impulse, moves, (b,)
     links: Indices  # pairs of bodies that joints link, (l, 2)
 
     @classmethod
@@ -59,12 +59,15 @@ class ContactSystem:
         links: Indices = NO_LINKS,
         carried: Carried = NOT_CARRIED,
     ) -> ContactSystem:
-        """The system of some contacts of n moving bodies, which come first in the numbering of bodies."""
-        n, c = len(position), len(carried.rows)
+        """The system of some contacts of n moving bodies, which come first in the numbering of bodies.
+
+        How easily impulses move them is given, (b - c, 7), with one that stands still and the points of joints.
+        """
+        n, c, before = len(position), len(carried.rows), len(ease)
         bodies = np.minimum(np.stack([contacts.first, contacts.second], axis=1), n).astype(np.int32)
-        bodies[carried.rows, carried.sides] = n + 1 + np.arange(c)
+        bodies[carried.rows, carried.sides] = before + np.arange(c)
         ease = np.concatenate([ease, np.zeros((c, 7))])
-        position = np.concatenate([position, np.zeros((1, 3)), contacts.point[carried.rows]])
+        position = np.concatenate([position, np.zeros((before - n, 3)), contacts.point[carried.rows]])
         islands = _islands(bodies, ease[:, 0] > 0.0, links)
         return cls(contacts.point, contacts.normal, bodies, position, ease, *islands, links)
 

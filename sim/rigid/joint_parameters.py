@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -65,7 +65,7 @@ class MotorParameters(Parameters):
 
 
 class JointParameters(Parameters):
-    """A joint between two rigid bodies, or one and the world."""
+    """A joint between two rigid bodies, or one and the world, or a point of a cloth."""
 
     name: BodyName = Field(description="Name of the joint, unique among joints.")
     kind: JointKind = Field(
@@ -73,7 +73,10 @@ class JointParameters(Parameters):
         "distance: a rod between two points; spring: with a damper; rope: no longer than its length."
     )
     between: tuple[BodyName, ...] = Field(
-        min_length=1, max_length=2, description="Names of two rigid bodies, or of one that is joined to the world."
+        min_length=1,
+        max_length=2,
+        description="Names of two rigid bodies, or of one that is joined to the world; or of one and a cloth, of which "
+        "the node nearest to the anchor is held.",
     )
     anchor: Vector3 | None = Field(
         default=None,
@@ -211,19 +214,18 @@ def joint_problems(
         if joint.name in names:
             yield JointProblem(number, "name", f'"{joint.name}" is taken by joint[{names[joint.name]}]; take another')
         names.setdefault(joint.name, number)
-        if unknown := [name for name in joint.between if name not in kinds]:
-            if unknown[0] in cloths:
-                sentence = (
-                    f'names the cloth "{unknown[0]}", and joints hold rigid bodies alone; let the cloth lie on one'
-                )
-                yield JointProblem(number, "between", sentence)
-                continue
+        held_cloths = [name for name in joint.between if name in cloths]
+        if unknown := [name for name in joint.between if name not in kinds and name not in held_cloths]:
             known = f"rigid bodies are {', '.join(kinds)}" if kinds else "add [[rigid]]"
+            known += f"; cloths are {', '.join(cloths)}" if cloths else ""
             yield JointProblem(number, "between", f'names no rigid body with "{unknown[0]}"; {known}')
             continue
         if breaking := [name for name in joint.between if name in pieces]:
             sentence = f'holds "{breaking[0]}", a piece of a body that breaks, which no joint can; remove one of both'
             yield JointProblem(number, "between", sentence)
+            continue
+        if held_cloths:
+            yield from _problems_with_cloth(number, joint, kinds, held_cloths, bodies)
             continue
         if all(kinds[name] != "dynamic" for name in joint.between):
             told = " and ".join(f'"{name}" is {kinds[name]}' for name in joint.between)
@@ -245,6 +247,38 @@ def joint_problems(
             held[pair].append(joint)
             continue
         yield from _problems_of_a_line(number, joint, bodies)
+
+
+def _problems_with_cloth(
+    number: int,
+    joint: JointParameters,
+    kinds: Mapping[str, str],
+    cloths: Sequence[str],
+    bodies: Sequence[RigidBodyParameters],
+) -> Iterator[JointProblem]:
+    """Of a joint that names cloths: one end is a dynamic body, and a point of cloth has no directions."""
+    led = [name for name in joint.between if kinds.get(name, "dynamic") != "dynamic"]
+    if len(cloths) == 2:
+        yield JointProblem(number, "between", f'joins the cloths "{cloths[0]}" and "{cloths[1]}"; join both to a body')
+    elif len(joint.between) == 1 or led:
+        other = f'"{led[0]}", which is {kinds[led[0]]}' if led else "the world"
+        pin = "[[cloth.pin]] with such keyframes" if led and kinds[led[0]] == "kinematic" else "[[cloth.pin]]"
+        yield JointProblem(number, "between", f'joins the cloth "{cloths[0]}" to {other}; hold it there by a {pin}')
+    elif joint.kind in RIGID_KINDS and joint.kind != "ball":
+        yield JointProblem(
+            number, "kind", f'is a {joint.kind} at the cloth "{cloths[0]}", a point of which has no directions; use a '
+            "ball, a distance, a spring or a rope",
+        )  # fmt: skip
+    elif joint.cone_deg is not None:
+        yield JointProblem(
+            number, "cone_deg", f'is about an axis of the cloth "{cloths[0]}", a point of which has no directions; '
+            "remove axis and cone_deg",
+        )  # fmt: skip
+    elif joint.kind != "ball":
+        if joint.anchors is None:
+            yield JointProblem(number, "", f"anchors are missing; a {joint.kind} to a cloth needs its two points")
+        else:
+            yield from _problems_of_a_line(number, joint, bodies)
 
 
 def _problems_of_a_line(

@@ -20,11 +20,11 @@ class JointSystem:
 
     elimination: Elimination
     is_there: NDArray[np.bool_]  # rows of joints that are not broken, whose bodies do not sleep, (r,)
-    bodies: Indices  # numbers of the two bodies, n for what stands, (r, 2)
+    bodies: Indices  # numbers of the two bodies, (r, 2)
     movers: NDArray[np.int32]  # likewise, -1 where no impulse moves it
     jacobian: Array  # of the velocities (v, omega) of the two bodies, (r, 2, 6)
     response: Array  # M⁻¹ Jᵀ, (r, 2, 6)
-    body_count: int  # n
+    body_count: int  # all bodies, what stands and points among them
 
     @classmethod
     def build(
@@ -36,29 +36,28 @@ class JointSystem:
         inverse_mass: Array,
         inverse_inertia: Array,
     ) -> JointSystem:
-        """The system of n moving bodies with inverse masses, (n,), and inertia, (n, 3, 3), where impulses move them."""
-        n = len(inverse_mass)
-        moves = np.append(inverse_mass > 0.0, False)[bodies]
-        number = np.where(bodies < n, bodies, 0)
+        """The system of bodies with inverse masses, (b,), and inertia, (b, 3, 3); 0 where impulses do not move them."""
+        moves = (inverse_mass > 0.0)[bodies]
         response = np.empty_like(jacobian)
-        response[..., :3] = jacobian[..., :3] * np.where(moves, inverse_mass[number], 0.0)[:, :, None]
-        inertia = np.where(moves[:, :, None, None], inverse_inertia[number], 0.0)
+        response[..., :3] = jacobian[..., :3] * np.where(moves, inverse_mass[bodies], 0.0)[:, :, None]
+        inertia = np.where(moves[:, :, None, None], inverse_inertia[bodies], 0.0)
         response[..., 3:] = np.einsum("rsij,rsj->rsi", inertia, jacobian[..., 3:])
         there = is_there & moves.any(axis=1)
-        return cls(elimination, there, bodies, np.where(moves, bodies, -1).astype(np.int32), jacobian, response, n)
+        movers = np.where(moves, bodies, -1).astype(np.int32)
+        return cls(elimination, there, bodies, movers, jacobian, response, len(inverse_mass))
 
     def velocities(self, of_bodies: Array) -> Array:
-        """Velocities of the rows, (r,), of velocities (v, omega) of all bodies, (n + 1, 6)."""
+        """Velocities of the rows, (r,), of velocities (v, omega) of all bodies, (b, 6)."""
         return np.einsum("rsi,rsi->r", self.jacobian, of_bodies[self.bodies])
 
     def change(self, impulses: Array) -> Array:
-        """What impulses, (r,), change of the velocities (v, omega) of all bodies, (n + 1, 6)."""
-        change = np.zeros((self.body_count + 1, 6))
+        """What impulses, (r,), change of the velocities (v, omega) of all bodies, (b, 6)."""
+        change = np.zeros((self.body_count, 6))
         np.add.at(change, self.bodies, self.response * impulses[:, None, None])
         return change
 
     def torques(self, impulses: Array) -> Array:
-        """Angular impulses on the moving bodies [N m s], (n, 3), of impulses, (r,)."""
+        """Angular impulses on all bodies [N m s], (b, 3), of impulses, (r,)."""
         sums = np.zeros((self.body_count + 1, 3))
         np.add.at(sums, self.movers, self.jacobian[..., 3:] * impulses[:, None, None])
         return sums[:-1]
@@ -127,12 +126,12 @@ class JointSolution:
     """Impulses of joints, and velocities with them."""
 
     impulses: Array  # (r,)
-    velocity: Array  # (v, omega) of all bodies [m/s], [rad/s], (n + 1, 6)
+    velocity: Array  # (v, omega) of all bodies [m/s], [rad/s], (b, 6)
     converged: bool  # whether it was found in all components
 
 
 def solve_alone(demand: JointDemand, velocity: Array) -> JointSolution:
-    """Impulses of joints alone, of all bodies with velocities (v, omega) without them [m/s], [rad/s], (n + 1, 6)."""
+    """Impulses of joints alone, of all bodies with velocities (v, omega) without them [m/s], [rad/s], (b, 6)."""
     from sim.rigid.joint_kernels import IMPULSE, solve_joints
 
     rows, velocity = demand.rows(), velocity.copy()

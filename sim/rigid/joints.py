@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,12 @@ from sim.core.motion import rotation
 from sim.core.solver import Arrays, Diagnostics
 from sim.rigid.contacts import Array, Indices, pair_keys
 from sim.rigid.joint_order import elimination_of
-from sim.rigid.joint_parameters import JointParameters, points_of
+from sim.rigid.joint_parameters import RIGID_KINDS, JointParameters, points_of
+from sim.rigid.joint_points import JointPoints, no_points
 from sim.rigid.joint_system import UNBOUNDED, JointDemand, JointSolution, JointSystem, solve_alone
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.states import MovingBodies, turned_freely
+from sim.rigid.steps import groups_of
 
 POINT, ACROSS, ALONG, LENGTH, TURN, ALIGN, ANGLE, SWING = range(8)
 """What a row is about: the way between the two points; its parts across and along the axis; its length; the turn of one
@@ -55,12 +58,13 @@ class JointStep:
     system: JointSystem
     values: Array  # of all rows, (r,)
     dt: float  # [s]
-    velocity: Array  # of the bodies before their impulses, (n, 6)
+    velocity: Array  # of all bodies before their impulses, (b, 6)
     speeds: Array  # that motors want, (r,), 0 elsewhere
 
 
 class Joints:
-    """All joints of a scene; the bodies that move are numbered as in `MovingBodies`, and n is all that stands.
+    """All joints of a scene; the n bodies that move are numbered as in `MovingBodies`, n is all that stands, and points
+    follow.
 
     Where nothing touches, a step is one of RATTLE (Andersen 1983; for bodies that turn freely in between, Reich 1996):
     impulses at its start hold the joints at its end, and impulses at its end hold their velocities; it is of second
@@ -75,6 +79,7 @@ class Joints:
     Attributes:
         names: (j,).
         is_broken: (j,).
+        points: that joints hold beside bodies.
     """
 
     def __init__(
@@ -82,8 +87,10 @@ class Joints:
         parameters: Sequence[JointParameters],
         everybody: Sequence[RigidBodyParameters],
         bodies: MovingBodies,
+        points: JointPoints | None = None,
     ) -> None:
-        """Take the joints of a scene, without problems, and its bodies where they start."""
+        """Take the joints of a scene, without problems, its bodies where they start, and points."""
+        self.points = no_points(len(parameters)) if points is None else points
         self.names, self._parameters, self._n = (
             tuple(joint.name for joint in parameters),
             tuple(parameters),
@@ -92,13 +99,14 @@ class Joints:
         numbers = {body.name: number for number, body in enumerate(everybody)}
         named = np.array([[numbers.get(name, -1) for name in (*joint.between, None)[:2]] for joint in parameters])
         self._named = np.where(named < 0, len(everybody), named)
-        self._bodies = np.minimum(self._named, self._n)  # (j, 2)
+        ends = self.points.ends
+        self._bodies = np.where(ends >= 0, self._n + 1 + ends, np.minimum(self._named, self._n))  # (j, 2)
         self.is_broken = np.zeros(len(parameters), dtype=bool)
         self._touches = np.array([joint.contacts for joint in parameters])
         self._members = np.unique(self._bodies[self._bodies < self._n])
         self._place(parameters, everybody, bodies)
         self._make_rows(parameters)
-        self._order = elimination_of(self._bodies, self._counts, np.append(bodies.is_dynamic, False))
+        self._order = elimination_of(self._bodies, self._counts, self._with_points(bodies.is_dynamic, True))
         row = self._first_rows[self._order.joint] + self._order.number
         self._joint, self._about, self._part, self._sign, self._offset, self._does = (
             self._joint[row],
@@ -125,9 +133,13 @@ class Joints:
     ) -> None:
         """Fix points and axes to the bodies."""
         points = np.array([points_of(joint, everybody) for joint in parameters], dtype=np.float64)
+        for number, ends in enumerate(self.points.ends):
+            for side in np.flatnonzero(ends >= 0):
+                both = slice(None) if parameters[number].kind in RIGID_KINDS else side
+                points[number, both] = self.points.position[ends[side]]
         axes = np.array([joint.axis or (0.0, 0.0, 1.0) for joint in parameters], dtype=np.float64)
         axes /= np.sqrt(np.square(axes).sum(axis=1))[:, None]
-        position, orientation = self._with_world(bodies.position, bodies.orientation)
+        position, orientation = self._with_world(bodies.position, bodies.orientation, self.points.position)
         first, second = self._bodies.T
         inverse = rotation.conjugate(orientation[self._bodies])
         # The point of each body, its axis, and tangents across that.
@@ -141,7 +153,9 @@ class Joints:
         given = np.array([np.nan if joint.length is None else joint.length for joint in parameters])
         self._length = np.where(np.isnan(given), lengths, given)
         for number, joint in enumerate(parameters):
-            if joint.kind == "distance":
+            # The node of a cloth may be a little farther than the place that was given.
+            is_short = joint.kind == "rope" and (self.points.ends[number] >= 0).any()
+            if joint.kind == "distance" or (is_short and self._length[number] < lengths[number]):
                 self._length[number] = lengths[number]
 
     def _make_rows(self, parameters: Sequence[JointParameters]) -> None:
@@ -194,7 +208,8 @@ class Joints:
 
     def untouching(self) -> Indices:
         """Keys of the pairs of bodies that do not touch each other, as joints hold them, ascending."""
-        first, second = np.sort(self._named[~self.is_broken & ~self._touches], axis=1).T
+        holds = ~self.is_broken & ~self._touches & (self.points.ends < 0).all(axis=1)
+        first, second = np.sort(self._named[holds], axis=1).T
         return np.unique(pair_keys(first, second))
 
     def links(self) -> tuple[Indices, Indices]:
@@ -205,15 +220,15 @@ class Joints:
 
     def beside(self, moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Bodies, (n,), that joints hold to bodies that move, (n,)."""
-        among, beside = np.append(moves, False), np.zeros(self._n + 1, dtype=bool)
+        among, beside = self._with_points(moves, False), self._with_points(np.zeros(self._n, dtype=bool), False)
         first, second = self._bodies[~self.is_broken].T
         beside[first[among[second]]] = beside[second[among[first]]] = True
         return beside[: self._n]
 
     def driven(self) -> NDArray[np.bool_]:
-        """Moving bodies that a motor keeps turning or going, (n,)."""
-        restless = np.zeros(self._n + 1, dtype=bool)
-        rows = (self._speed != 0.0) & ~self.is_broken[self._joint]
+        """Moving bodies that a motor keeps turning or going, or that hang on a point, which never rests, (n,)."""
+        restless = self._with_points(np.zeros(self._n, dtype=bool), False)
+        rows = ((self._speed != 0.0) | (self._row_bodies > self._n).any(axis=1)) & ~self.is_broken[self._joint]
         restless[self._row_bodies[rows]] = True
         return restless[: self._n]
 
@@ -228,19 +243,19 @@ class Joints:
         if not system.is_there.any():
             return None
         speeds = np.where(np.isnan(self._goal), self._speed, (self._goal - values) / self._response)
-        velocity = np.concatenate([bodies.velocity, bodies.angular_velocity], axis=1)
-        return JointStep(system, values, dt, velocity, speeds)
+        return JointStep(system, values, dt, self._velocities(bodies), speeds)
 
     def _system(
         self, bodies: MovingBodies, is_active: NDArray[np.bool_], inverse_inertia: Array
     ) -> tuple[JointSystem, Array, Array]:
         """The rows where the bodies are now, their values, and the angles of all hinges [rad], (j,)."""
-        frames = self._frames(bodies.position, bodies.orientation)
+        frames = self._frames(bodies.position, bodies.orientation, self.points.position)
         direction = self._directions(frames)
-        among = np.append(is_active, False)
+        among = self._with_points(is_active, self.points.is_free)
         is_there = ~self.is_broken[self._joint] & among[self._row_bodies].any(axis=1)
         jacobian = self._jacobian(frames, direction)
-        inverse_mass = np.where(is_active, bodies.inverse_mass, 0.0)
+        inverse_mass = self._with_points(np.where(is_active, bodies.inverse_mass, 0.0), self.points.inverse_mass)
+        inverse_inertia = np.concatenate([inverse_inertia, np.zeros((1 + len(self.points), 3, 3))])
         system = JointSystem.build(self._order, is_there, self._row_bodies, jacobian, inverse_mass, inverse_inertia)
         return system, self._values(frames), frames.angle
 
@@ -301,18 +316,22 @@ class Joints:
         system, dt, n = step.system, step.dt, self._n
         component = self._order.component
         pushed = np.zeros(len(self._order.components), dtype=bool)
-        touched = np.append(is_touched, False)
+        touched = self._with_points(is_touched, False)
         np.logical_or.at(pushed, component, (touched[self._row_bodies] & (system.movers >= 0)).any(axis=1))
         whole = pushed[component]  # whether a row acts in one impulse for all of the step
+        velocity = self._velocities(bodies)
         for side in range(2):
             rows = system.is_there & (system.movers[:, side] >= 0)
-            is_touched[system.movers[rows & whole, side]] = True
+            touched[system.movers[rows & whole, side]] = True
             alone = system.movers[rows & ~whole, side]
-            bodies.velocity[alone], bodies.angular_velocity[alone] = step.velocity[alone, :3], step.velocity[alone, 3:]
+            velocity[alone] = step.velocity[alone]
+        is_touched |= touched[:n]
         total = np.where(whole & system.is_there, impulses, 0.0)
         duration_s = np.where(whole, dt, 0.5 * dt)
         lower, upper = self._bounds(duration_s)
         softness = self._softness(duration_s, dt)
+        self._set_velocities(bodies, velocity)
+        of_points = self.points.drift(dt, touched[n + 1 :])
 
         moving = self._members
         fall = np.where(bodies.is_dynamic & ~is_touched, 0.5 * dt, 0.0)[:, None] * gravity
@@ -324,7 +343,7 @@ class Joints:
         is_led = ~bodies.is_dynamic[moving]
         led = rotation.product(rotation.exponential(dt * bodies.angular_velocity[moving]), bodies.orientation[moving])
         position, orientation = bodies.position.copy(), bodies.orientation.copy()
-        still = np.zeros((n + 1, 6))
+        still = np.zeros_like(velocity)
         change, converged = still.copy(), False
         start = step.values
         wanted = np.where((self._does == HOLDS) | (start < 0.0), (1.0 - CLOSING_SHARE) * start, 0.0)
@@ -348,12 +367,12 @@ class Joints:
                 base_orientation, bodies.principal_orientation[moving], bodies.principal_moments[moving], turning, dt
             )
             orientation[moving] = np.where(is_led[:, None], led, free)
-            frames = self._frames(position, orientation)
+            frames = self._frames(position, orientation, self.points.position + dt * (of_points + change[n + 1 :, :3]))
             values = self._values(frames)
             found = solve(values)
             total = total + found.impulses
             change += found.velocity
-            spin += system.torques(found.impulses)
+            spin += system.torques(found.impulses)[:n]
             moved = dt * float(np.abs(system.velocities(found.velocity))[system.is_there].max())
             if not found.converged or not moved < DIVERGES * least:
                 break
@@ -363,13 +382,13 @@ class Joints:
                 break
         if not converged:
             # As if joints stayed as they are: that adds no energy, and leaves gaps of second order.
-            total, velocity = before, still.copy()
-            velocity[:-1, :3], velocity[:-1, 3:] = bodies.velocity - fall, bodies.angular_velocity
-            velocity[:-1] += extra
+            total = before
+            velocity[:n, :3] -= fall
+            velocity[:n] += extra
+            velocity[n + 1 :, :3] = of_points
             found = solve(start + dt * system.velocities(velocity))
             total, change = total + found.impulses, found.velocity
-        bodies.velocity = bodies.velocity + change[:n, :3]
-        bodies.angular_velocity = bodies.angular_velocity + change[:n, 3:]
+        self._set_velocities(bodies, self._velocities(bodies) + change)
         was_held = float(np.max(np.abs(start), initial=0.0, where=holds)) <= APART
         return JointHold(step, whole, total, converged, was_held and not converged)
 
@@ -385,16 +404,14 @@ class Joints:
         self._angle = np.where(is_there, angle, self._angle)
         does, first, whole = self._does, hold.impulses, hold.is_whole
         kick = np.where((does == PULLS) & ~whole & before.is_there, first, 0.0)
-        velocity = system.change(kick)
-        velocity[:-1, :3] += bodies.velocity
-        velocity[:-1, 3:] += bodies.angular_velocity
+        velocity = system.change(kick) + self._velocities(bodies)
         takes_part = system.is_there & (
             (does == HOLDS) | ((does == LIMITS) & (first > 0.0)) | ((does == DRIVES) & ~whole)
         )
         bias = np.where(does == DRIVES, -step.speeds, 0.0)
         lower, upper = self._bounds(0.5 * dt)
         found = solve_alone(JointDemand(system, takes_part, bias, np.zeros(len(does)), lower, upper), velocity)
-        bodies.velocity, bodies.angular_velocity = found.velocity[:-1, :3].copy(), found.velocity[:-1, 3:].copy()
+        self._set_velocities(bodies, found.velocity)
 
         last = kick + found.impulses
         self._break(before, first, system, last, dt)
@@ -428,8 +445,8 @@ class Joints:
         masses of all directions.
         """
         system, _, _ = self._system(bodies, np.ones(len(bodies), dtype=bool), inverse_inertia)
-        alone = system.is_there & (self._does == HOLDS) & ((system.movers >= 0).sum(axis=1) == 1)
         movers = system.movers.max(axis=1)
+        alone = system.is_there & (self._does == HOLDS) & ((system.movers >= 0).sum(axis=1) == 1) & (movers < self._n)
         for body in np.unique(movers[alone]):
             rows = np.flatnonzero(alone & (movers == body))
             side = np.argmax(system.movers[rows], axis=1)
@@ -458,8 +475,9 @@ class Joints:
         }
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """What is broken, and the angles of hinges, whole turns included [rad]."""
-        return {"joints_broken": self.is_broken.copy(), "joint_angles": self._angle.copy()}
+        """What is broken, the angles of hinges, whole turns included [rad], and the points."""
+        own = {"joints_broken": self.is_broken.copy(), "joint_angles": self._angle.copy()}
+        return {**own, **self.points.checkpoint()}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint. Raises ValueError when an array is missing or has another shape."""
@@ -468,14 +486,42 @@ class Joints:
                 raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape ({len(self)},)")
         self.is_broken = np.array(arrays["joints_broken"], dtype=bool)
         self._angle = np.array(arrays["joint_angles"], dtype=np.float64)
+        self.points.restore(arrays)
 
-    def _with_world(self, position: Array, orientation: Array) -> tuple[Array, Array]:
-        """Poses of the moving bodies and of the world, (n + 1, ...)."""
-        return np.concatenate([position, np.zeros((1, 3))]), np.concatenate([orientation, [[1.0, 0.0, 0.0, 0.0]]])
+    def hanging_mass(self, bodies: MovingBodies) -> Array:
+        """Mass of all that hangs together with each point, itself included [kg], (h,)."""
+        mass = self._with_points(np.where(bodies.is_free, bodies.mass, 0.0), self.points.mass)
+        first, second = self._bodies[~self.is_broken & (mass[self._bodies] > 0.0).all(axis=1)].T
+        groups = groups_of(first, second, len(mass))
+        result: Array = np.bincount(groups, weights=mass)[groups][self._n + 1 :]
+        return result
 
-    def _frames(self, position: Array, orientation: Array) -> _Frames:
-        """Where the joints are with bodies in these poses, (n, 3) and (n, 4)."""
-        position, orientation = self._with_world(position, orientation)
+    def _with_points(self, of_bodies: NDArray[Any], of_points: NDArray[Any] | bool) -> NDArray[Any]:
+        """Values of the moving bodies, of what stands, 0, and of points, (b,)."""
+        own = np.broadcast_to(np.asarray(of_points, dtype=of_bodies.dtype), len(self.points))
+        return np.concatenate([of_bodies, np.zeros(1, dtype=of_bodies.dtype), own])
+
+    def _velocities(self, bodies: MovingBodies) -> Array:
+        """Velocities (v, omega) of bodies, of what stands and of points, (b, 6)."""
+        n, velocity = self._n, np.zeros((self._n + 1 + len(self.points), 6))
+        velocity[:n, :3], velocity[:n, 3:] = bodies.velocity, bodies.angular_velocity
+        velocity[n + 1 :, :3] = self.points.velocity
+        return velocity
+
+    def _set_velocities(self, bodies: MovingBodies, velocity: Array) -> None:
+        """Give bodies and points such velocities, (b, 6)."""
+        n = self._n
+        bodies.velocity, bodies.angular_velocity = velocity[:n, :3].copy(), velocity[:n, 3:].copy()
+        self.points.velocity = velocity[n + 1 :, :3].copy()
+
+    def _with_world(self, position: Array, orientation: Array, of_points: Array) -> tuple[Array, Array]:
+        """Poses of the moving bodies, of the world and of points, (b, ...)."""
+        unturned = np.tile([1.0, 0.0, 0.0, 0.0], (1 + len(of_points), 1))
+        return np.concatenate([position, np.zeros((1, 3)), of_points]), np.concatenate([orientation, unturned])
+
+    def _frames(self, position: Array, orientation: Array, of_points: Array) -> _Frames:
+        """Where the joints are with bodies in these poses, (n, 3) and (n, 4), and points, (h, 3)."""
+        position, orientation = self._with_world(position, orientation, of_points)
         centres, turned = position[self._bodies], orientation[self._bodies]
         own = rotation.rotated(turned[:, :, None], self._own)
         axis, own_axis, tangents = own[:, 1, 1], own[:, 0, 1], own[:, 1, 2:]

@@ -25,6 +25,7 @@ from sim.rigid.contact_solver import NOT_CARRIED, Carried
 from sim.rigid.contacts import Contacts, Indices
 from sim.rigid.glue import MOST_ROUNDS, Glue
 from sim.rigid.joint_parameters import JointParameters
+from sim.rigid.joint_points import JointPoints
 from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.parts import PartsDetector, detector_of
@@ -91,6 +92,7 @@ class RigidSolver:
         *,
         obstacles: Sequence[RigidBodyParameters] = (),
         joints: Sequence[JointParameters] = (),
+        points: JointPoints | None = None,
         domain: DomainParameters,
         gravity: Vector3,
         forces: ForceField | None = None,
@@ -127,7 +129,7 @@ class RigidSolver:
         self._response = ContactResponse(self.surfaces, self.gravity)
         corners = np.array([domain.min, domain.max])
         self._chooser = StepChooser(self.all_geometries, self.bodies, self.walls, self._detector, self.gravity)
-        self.joints = Joints(joints, everybody, self.bodies) if joints else None
+        self.joints = Joints(joints, everybody, self.bodies, points) if joints else None
         has_pieces = any(body.whole is not None for body in parameters)
         self.glue = Glue(parameters, self.solids, self.bodies) if has_pieces else None
         self._obey_links()
@@ -243,6 +245,9 @@ class RigidSolver:
         if glue is not None:
             self.bodies.describe(everybody, self._pose, np.zeros_like(ease))
         joints, unstopped = self.joints, (bodies.velocity, bodies.angular_velocity)
+        points = None if joints is None else joints.points.state()
+        if joints is not None:
+            joints.points.push(dt)
         self._detector.find(self._poses_described(), reach, among, time_s)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
         carried = partial(self._carried, time_s=time_s + 0.5 * dt) if self.deforming else None
@@ -277,7 +282,8 @@ class RigidSolver:
                 extra=outcome.extra[:-1],
                 is_held=outcome.is_held,
             )
-            if hold.is_too_long and halvings > 0:
+            if hold.is_too_long and halvings > 0 and points is not None:
+                joints.points.set_state(points)
                 bodies.position, bodies.orientation = before
                 bodies.velocity, bodies.angular_velocity = velocities
                 for half in range(2):
@@ -291,6 +297,8 @@ class RigidSolver:
         )
         if glue is not None:
             glue.scatter()
+        if joints is not None:
+            joints.points.fly_on(dt)
         self._place_kinematic_bodies(time_s + dt)
         self._detector.follow(self._with_obstacles(self._surface_motion_since(*poses_before)))
         if joints is not None and hold is not None:

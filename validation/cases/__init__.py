@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 CASES = (
     "kernel", "hydrostatic", "dam-break", "box-impact", "turned-jet", "rayleigh-taylor", "elliptical-drop",
     "swinging-drop", "viscosity",
-    "free-momentum", "coupled-momentum", "rigid-motion", "rigid-contacts", "joints", "inertia", "cloth",
-    "cloth-crossings",
+    "free-momentum", "coupled-momentum", "rigid-motion", "rigid-contacts", "joints", "pyramid", "inertia",
+    "cloth", "cloth-crossings",
     "smoke-vortices", "smoke-projection", "smoke-plume", "smoke-front", "smoke-mass", "submerged-sphere", "buoyancy",
     "bunny-energy",
 )  # fmt: skip

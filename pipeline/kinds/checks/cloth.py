@@ -11,6 +11,7 @@ from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
 from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over, note_gaps
 from pipeline.kinds.checks.cloth_start import ClothStart, start_cloths
+from pipeline.kinds.checks.joints import check_joints_of_cloth, joined_to
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.pins import check_pin_load, check_pin_speeds, check_pin_times
 from pipeline.model.amounts import count
@@ -59,8 +60,10 @@ def check_cloths(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         check_pin_load(start, job, fluid_over(job, solids, start.box), findings)
         check_buoyancy(job, start.path, start.cloth, findings)
         note_gaps(job, start.path, start.cloth, findings)
+        check_joints_of_cloth(start, job, findings)
+        joined = joined_to(start.cloth, job)
         for path, solid in solids.items():
-            if path[0] == "rigid":
+            if path[0] == "rigid" and job.rigid[int(path[1])].name not in joined:
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
         _check_crossings(start, starts[:number], findings)
     _check_substeps([start for start in starts if start.cloth.integrator == "explicit"], job.fps, findings)

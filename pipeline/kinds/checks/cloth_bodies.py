@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_start import ClothStart
+from pipeline.kinds.checks.joints import joined_to
 from pipeline.kinds.checks.shapes import thin_wall_problem
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
@@ -43,6 +44,8 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
         body, thickness = job.rigid[int(path[1])], float(sides.min())
         too_coarse = []
         for start in starts:
+            if body.name in joined_to(start.cloth, job):
+                continue
             rod, pins = _Rod(body, solid, sides, start.longest_edge), start.cloth.pin
             if thickness < LEAST_EDGES * start.longest_edge and not any(
                 rod.stays_with(pins[pin], start.position[nodes], job.film_s) for pin, nodes in start.pinned.items()

@@ -80,6 +80,7 @@ def check_rigid_start(job: Job, solids: Solids, findings: Findings) -> None:
 
     Bodies without a shape in `solids` have been found wanting already; then nothing is looked at.
     """
+    # Joints to cloths keep no bodies from each other, and are refused where these are not told.
     refused = {problem.number for problem in joint_problems(job.joint, job.rigid)}
     joints = [joint for number, joint in enumerate(job.joint) if number not in refused]
     dynamic = [index for index, body in enumerate(job.rigid) if body.kind == "dynamic"]

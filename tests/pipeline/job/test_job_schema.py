@@ -87,12 +87,16 @@ def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     assert load_job(tmp_path / "poured.toml").fluid[0].emitter[0].follow == "jug"
     bodies = [
         f'[[rigid]]\nname = "{name}"\nkind = "dynamic"\ndensity = 500.0\n'
-        f'shape = {{ type = "sphere", radius = 0.1 }}\nposition = [{x}, 0.0, 0.24]\n'
-        for name, x in (("wheel", -0.3), ("car", 0.1), ("trailer", 0.4))
+        f'shape = {{ type = "sphere", radius = 0.1 }}\nposition = [{x}, 0.0, {z}]\n'
+        for name, x, z in (("wheel", -0.3, 0.24), ("car", 0.1, 0.24), ("trailer", 0.4, 0.24), ("lamp", 0.0, 0.8))
     ]
-    (tmp_path / "joined.toml").write_text(f'name = "joined"\n{joints}{"".join(bodies)}')
+    awning = (
+        '[[cloth]]\nname = "awning"\nshape = { type = "rectangle", size = [0.4, 0.4], resolution = 0.05 }\n'
+        'position = [0.0, 0.0, 0.9]\npin = [{ edge = "x-" }, { edge = "x+" }]\n'
+    )
+    (tmp_path / "joined.toml").write_text(f'name = "joined"\n{joints}{"".join(bodies)}{awning}')
     loaded, findings = load_checked_job(tmp_path / "joined.toml")
-    assert [joint.name for joint in loaded.job.joint] == ["axle", "tow"]
+    assert [joint.name for joint in loaded.job.joint] == ["axle", "tow", "hook"]
     assert findings.warnings == []
     plume = '[[smoke]]\nname = "smoke"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.1 }\n'
     plume += "position = [0.0, 0.0, 0.3]\n"

@@ -125,6 +125,51 @@ def test_joints_that_cannot_be_are_told_with_a_remedy(case):
     assert message in str(refused.value)
 
 
+AT_CLOTH = {
+    "hinge": ({"between": ("a", "sail"), **HINGE}, 'kind is a hinge at the cloth "sail", a point of which has no'),
+    "fixed": ({"between": ("sail", "a"), "kind": "fixed", "anchor": POINT}, "use a ball, a distance, a spring or a"),
+    "cone": (
+        {"between": ("a", "sail"), "kind": "ball", "anchor": POINT, "axis": AXIS, "cone_deg": 20},
+        'cone_deg is about an axis of the cloth "sail"',
+    ),
+    "world": (
+        {"between": ("sail",), "kind": "ball", "anchor": POINT},
+        'between joins the cloth "sail" to the world; hold it there by a [[cloth.pin]]',
+    ),
+    "static body": (
+        {"between": ("post", "sail"), "kind": "rope", "anchors": (POINT, POINT)},
+        'joins the cloth "sail" to "post", which is static',
+    ),
+    "kinematic body": (
+        {"between": ("hand", "sail"), "kind": "ball", "anchor": POINT},
+        'to "hand", which is kinematic; hold it there by a [[cloth.pin]] with such keyframes',
+    ),
+    "two cloths": (
+        {"between": ("jib", "sail"), "kind": "rope", "anchors": (POINT, POINT)},
+        'joins the cloths "jib" and "sail"; join both to a body',
+    ),
+    "no anchors": (
+        {"between": ("a", "sail"), "kind": "rope"},
+        "anchors are missing; a rope to a cloth needs its two points",
+    ),
+    "no length": (
+        {"between": ("a", "sail"), "kind": "distance", "anchors": (POINT, POINT)},
+        "anchors its two points are one",
+    ),
+    "unknown": (
+        {"between": ("a", "sial"), "kind": "ball", "anchor": POINT},
+        'names no rigid body with "sial"; rigid bodies are a, b, post, wall, hand; cloths are sail, jib',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", AT_CLOTH)
+def test_joints_to_cloth_that_cannot_be_are_told_with_a_remedy(case):
+    given, message = AT_CLOTH[case]
+    (problem,) = joint_problems([JointParameters(name="j", **given)], BODIES, ("sail", "jib"))
+    assert message in problem.text
+
+
 def test_what_makes_sense_is_taken():
     joints = [
         JointParameters(name="two", between=("a", "b"), kind="ball", anchor=POINT),
@@ -132,5 +177,7 @@ def test_what_makes_sense_is_taken():
         JointParameters(name="rope", between=("a", "b"), kind="rope"),
         JointParameters(name="led", between=("a", "hand"), kind="slider", axis=AXIS, limits=(0, 2)),
         JointParameters(name="stands", between=("b", "post"), kind="fixed"),
+        JointParameters(name="hook", between=("b", "sail"), kind="ball", anchor=POINT),
+        JointParameters(name="sheet", between=("sail", "a"), kind="rope", anchors=((3, 0, 1), POINT)),
     ]
-    assert not list(joint_problems(joints, BODIES))
+    assert not list(joint_problems(joints, BODIES, ("sail",)))

@@ -54,14 +54,49 @@ def test_a_joint_far_from_its_body_is_told(tmp_path):
     ]
 
 
+BANNER = """
+[[cloth]]
+name = "banner"
+shape = { type = "rectangle", size = [0.4, 0.4], resolution = 0.05 }
+position = [0.15, 0.0, 0.6]
+
+[[cloth.pin]]
+edge = "x-"
+
+[[joint]]
+name = "hook"
+kind = "ball"
+between = ["arm", "banner"]
+anchor = [0.15, 0.0, HEIGHT]
+"""
+
+
+def test_a_joint_off_its_cloth_is_told_at_its_line(tmp_path):
+    def told(height):
+        return checked(BODIES + NAIL + BANNER.replace("HEIGHT", height), tmp_path / "job.toml")
+
+    assert not told("0.6").errors
+    assert told("0.8").errors == [
+        'job.toml:34 joint[1].anchor: is 0.2 m off the cloth "banner", whose nodes are at most 0.0707 m apart; move it '
+        "to the nearest one, at [0.15, 0, 0.6], or another"
+    ]
+
+
+def test_a_body_that_is_joined_to_cloth_may_be_in_it(tmp_path):
+    inside = (BODIES + NAIL + BANNER).replace("[0.15, 0.0, 0.6]", "[0.15, 0.0, 0.33]").replace("HEIGHT", "0.33")
+    assert not [line for line in checked(inside, tmp_path / "job.toml").errors if '"arm"' in line]
+    errors = checked(inside + "contacts = true\n", tmp_path / "job.toml").errors
+    assert any('starts inside "arm"' in line for line in errors)
+
+
 def test_joints_of_a_job_without_bodies_are_refused(tmp_path):
     text = 'name = "a"\nframes = 2\n' + NAIL
     errors = checked(text, tmp_path / "job.toml").errors
     assert any('names no rigid body with "arm"; add [[rigid]]' in line for line in errors)
 
 
-def test_a_joint_to_a_cloth_is_refused_by_name(tmp_path):
+def test_a_joint_that_would_turn_a_point_of_cloth_is_refused_by_name(tmp_path):
     sheet = '[[cloth]]\nname = "sheet"\nshape = { type = "rectangle", size = [0.1, 0.1], counts = [3, 3] }\n'
     sheet += "position = [0.0, 0.0, 0.9]\n"
     errors = checked(BODIES + NAIL.replace("post", "sheet") + sheet, tmp_path / "job.toml").errors
-    assert any('names the cloth "sheet", and joints hold rigid bodies alone' in line for line in errors)
+    assert any('is a fixed at the cloth "sheet", a point of which has no directions; use a ball' in e for e in errors)
