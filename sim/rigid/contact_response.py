@@ -73,9 +73,10 @@ class Outcome:
 class ContactResponse:
     """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
 
+    Contacts that neither bounce nor are of parts nor have joints, or what deforms, beside them are solved by a `Pile`.
+
     Attributes:
-        in_colours: whether contacts that neither bounce nor are of parts nor have joints, or what deforms, beside them
-            are solved by a `Pile`, many side by side: on GPUs, where islands would be solved by a thread each.
+        in_colours: whether it solves them many side by side: on GPUs, where islands would be solved by a thread each.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
@@ -109,7 +110,7 @@ class ContactResponse:
         if self.in_colours is None:
             self.in_colours = runs_on_gpu()
         needs_islands = step is not None or carried is not None or bool(self._surfaces.restitution.any())
-        if self.in_colours and not needs_islands and isinstance(detector, CollisionDetector):
+        if not needs_islands and isinstance(detector, CollisionDetector):
             return self._resolve_pile(detector, bodies, dt, ease)
         contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
@@ -164,7 +165,7 @@ class ContactResponse:
     def _resolve_pile(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Outcome:
         from sim.rigid.pile_kernels import Limits
 
-        self._pile = self._pile or Pile(detector, len(bodies))
+        self._pile = self._pile or Pile(detector, len(bodies), in_colours=bool(self.in_colours))
         n = len(bodies)
         velocity = np.zeros((n + 1, 6))
         velocity[:n, :3], velocity[:n, 3:] = bodies.velocity, bodies.angular_velocity
