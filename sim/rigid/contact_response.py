@@ -34,7 +34,7 @@ from sim.rigid.pile import Pile
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
-SEPARATION_TIME_S, LARGEST_SEPARATION = 0.02, 0.2  # in which overlaps decay, and by what share a step at most
+SEPARATION_TIME_S, LARGEST_SEPARATION = 0.01, 0.2  # in which overlaps decay, and by what share a step at most
 SLOP = 1.0e-6  # overlap that stays [m]: below what anybody sees, above what rounding makes
 MOST_ROUNDS = 50  # of impacts in a step; after them what still approaches no longer bounces
 WEIGHT_TOLERANCE = 1.0e-4  # of the speed that gravity gives in a step: what the last sweep may still change

@@ -76,16 +76,14 @@ class Pile:
             pass
         total = kernels.sort_pairs(count, near, contacts, pile, limits)
         kernels.gather_pile(total, near, contacts, bodies, placed, pile, limits)
-        colours = np.flatnonzero(np.diff(copied(pile.first)))
-        for colour in colours.tolist():
-            kernels.start_colour(colour, near, contacts, pile)
+        colours = int(copied(pile.turn)[2])
+        kernels.start_colour.repeat(colours, near, contacts, pile)
         for solve in range(2):
             for sweep in range(limits.most + 1):
                 kernels.begin_sweeps(solve, sweep, pile, limits, self._alive)
                 if sweep in LOOKS and not copied(self._alive)[solve, sweep]:
                     break
-                for colour in colours[:: 1 if sweep % 2 == 0 else -1].tolist():
-                    kernels.relax_colour(solve, sweep, colour, near, contacts, pile)
+                kernels.relax_colour.repeat(colours, solve, near, contacts, pile)
             if solve == 0:
                 kernels.finish_pairs(total, near, contacts, placed, pile, limits)
 
@@ -95,6 +93,7 @@ class Pile:
             rows = self._rows
             self._of_bodies = {
                 "first": ti.ndarray(ti.i32, kernels.COLOURS + 1),
+                "turn": ti.ndarray(ti.i32, 3),
                 "places": ti.ndarray(ti.i32, kernels.COLOURS),
                 "least": ti.ndarray(ti.i32, rows),
                 "masks": ti.ndarray(ti.i32, rows),

@@ -58,6 +58,7 @@ class Pile(NamedTuple):
     pairs: Whole  # those that have something to solve, by colour or by island, (p,)
     first: Whole  # first of each colour among these, and the end, (COLOURS + 1,)
     places: Whole  # likewise, while they are put there, (COLOURS,)
+    turn: Whole  # which sweep it is, how many colours had their turn in it, and how many there are, (3,)
     masks: Whole  # colours of the pairs of each body, (n + 1,)
     least: Whole  # least rank of a pair of each body that has no colour, (n + 1,)
     group: Whole  # least number of the bodies that hang together, (n + 1,): the island's
@@ -204,6 +205,7 @@ def sort_pairs(count: ti.i32, near: Near, kept: Kept, pile: Pile, limits: Limits
 
     Returns how many pairs have something to solve. Within a colour any order does.
     """
+    pile.turn[0], pile.turn[1], pile.turn[2] = 0, 0, 0
     for colour in range(COLOURS):
         pile.places[colour] = 0
     for pair in range(count):
@@ -215,6 +217,7 @@ def sort_pairs(count: ti.i32, near: Near, kept: Kept, pile: Pile, limits: Limits
     for colour in range(COLOURS):
         pairs = pile.places[colour]
         pile.first[colour], pile.places[colour] = total, total
+        pile.turn[2] += ti.cast(pairs > 0, ti.i32)  # those of bodies are the first that were left
         total += pairs
         pile.first[colour + 1] = total
     for pair in range(count):
@@ -434,21 +437,29 @@ def finish_pair(item: ti.i32, near: Near, kept: Kept, placed: Placed, pile: Pile
         ti.atomic_max(pile.islands[island, ASKS + 1], ti.cast(1, ti.i64))
 
 
+@func
+def next_colour(pile: Pile):
+    """The colour whose turn it is in a sweep, the last one first in every other: its first item and the end."""
+    turn = pile.turn[1]
+    pile.turn[1] = turn + 1
+    colour = ti.select(pile.turn[0] % 2 == 0, turn, pile.turn[2] - 1 - turn)
+    return pile.first[colour], pile.first[colour + 1], colour == MOST_COLOURS
+
+
 @kernel
-def start_colour(colour: ti.i32, near: Near, kept: Kept, pile: Pile):
-    """Give the bodies of all pairs of a colour the impulses that are started from."""
-    first, end = pile.first[colour], pile.first[colour + 1]
-    runs = ti.select(colour == MOST_COLOURS, ti.min(1, end - first), end - first)
+def start_colour(near: Near, kept: Kept, pile: Pile):
+    """Give the bodies of all pairs of the next colour the impulses that are started from."""
+    first, end, is_last = next_colour(pile)
+    runs = ti.select(is_last, ti.min(1, end - first), end - first)
     for run in range(runs):
-        for item in range(first + run, ti.select(colour == MOST_COLOURS, end, first + run + 1)):
+        for item in range(first + run, ti.select(is_last, end, first + run + 1)):
             start_pair(item, near, kept, pile)
 
 
 @kernel
 def begin_sweeps(solve: ti.template(), sweep: ti.i32, pile: Pile, limits: Limits, alive: WholeRows):
     """Let all bodies go on, before a sweep; counts islands that are not done, by solve and sweep."""
-    for _first in range(1):
-        alive[solve, sweep] = 0
+    alive[solve, sweep], pile.turn[0], pile.turn[1] = 0, sweep, 0
     for body in range(pile.group.shape[0]):
         if ti.static(solve == 0):
             begin_sweep(solve, sweep, body, pile, pile.velocity, limits, alive)
@@ -457,16 +468,16 @@ def begin_sweeps(solve: ti.template(), sweep: ti.i32, pile: Pile, limits: Limits
 
 
 @kernel
-def relax_colour(solve: ti.template(), sweep: ti.i32, colour: ti.i32, near: Near, kept: Kept, pile: Pile):
-    """Solve all pairs of a colour; those of the last one after the other."""
-    first, end = pile.first[colour], pile.first[colour + 1]
-    runs = ti.select(colour == MOST_COLOURS, ti.min(1, end - first), end - first)
+def relax_colour(solve: ti.template(), near: Near, kept: Kept, pile: Pile):
+    """Solve all pairs of the next colour; those of the last one after the other."""
+    first, end, is_last = next_colour(pile)
+    runs = ti.select(is_last, ti.min(1, end - first), end - first)
     for run in range(runs):
-        for item in range(first + run, ti.select(colour == MOST_COLOURS, end, first + run + 1)):
+        for item in range(first + run, ti.select(is_last, end, first + run + 1)):
             if ti.static(solve == 0):
-                relax_item(solve, sweep, item, near, kept, pile, pile.velocity)
+                relax_item(solve, pile.turn[0], item, near, kept, pile, pile.velocity)
             else:
-                relax_item(solve, sweep, item, near, kept, pile, pile.extra)
+                relax_item(solve, pile.turn[0], item, near, kept, pile, pile.extra)
 
 
 @kernel
