@@ -109,8 +109,12 @@ class ContactResponse:
             return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still, np.zeros((0, 3)))
         if self.in_colours is None:
             self.in_colours = runs_on_gpu()
-        needs_islands = step is not None or carried is not None or bool(self._surfaces.restitution.any())
-        if not needs_islands and isinstance(detector, CollisionDetector):
+        if (
+            step is None
+            and carried is None
+            and isinstance(detector, CollisionDetector)
+            and not self._bounce_in(detector)
+        ):
             return self._resolve_pile(detector, bodies, dt, ease)
         contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
@@ -161,6 +165,13 @@ class ContactResponse:
             by_joints + impacts.joint_impulses + solution.joint_impulses,
             impacts.impulses + solution.impulses,
         )
+
+    def _bounce_in(self, detector: CollisionDetector) -> bool:
+        """Whether any of the contacts may bounce."""
+        if not self._surfaces.restitution.any():
+            return False
+        contacts = detector.contacts()
+        return bool(self._surfaces.of_pairs(contacts.first, contacts.second)[1].any())
 
     def _resolve_pile(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Outcome:
         from sim.rigid.pile_kernels import Limits

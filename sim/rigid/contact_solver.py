@@ -14,7 +14,7 @@ from sim.rigid.joint_system import JointDemand
 MAX_ITERATIONS = 100
 NO_LINKS, NO_IMPULSES = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
 COARSE_SPEED = 0.05
-COARSE_WORK, FEWEST_ITERATIONS = 15_000, 12
+COARSE_WORK, FEWEST_ITERATIONS = 15_000, 15
 """Islands whose contacts are faster [m/s], in the mean, get as many sweeps as make so many looks at contacts, or the
 least: what is left of their overlap is far less than they move in the step."""
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
