@@ -93,7 +93,9 @@ class StepChooser:
             # Who left by an open face falls on, past the edges of the wall.
             meets = bodies.is_dynamic & (height > 0.0) & (aside <= self._radius[:n] + motion[:n])
             advance = np.maximum(self._advance[:n], 0.5 * (height - self._radius[:n]))
-            by_wall = time_of(advance, own, acceleration)
+            # Along a plane it may get as far as it likes.
+            towards = np.abs(bodies.velocity[:, wall.axis]) + spin * self._radius[:n] + bodies.deforming
+            by_wall = time_of(advance, towards, acceleration)
             alone_s = np.where(meets, np.minimum(alone_s, by_wall), alone_s)
         return Meetings(first, second, time_s, alone_s)
 
