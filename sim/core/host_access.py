@@ -85,7 +85,13 @@ def copied(array: ti.Ndarray) -> NDArray[np.generic]:
 
 
 def _layout(array: ti.Ndarray) -> tuple[np.dtype[np.generic], tuple[int, ...]]:
-    return np.dtype(to_numpy_type(array.dtype)), (*array.shape, *array.element_shape)
+    """Type and shape of the numbers of an array, which it never changes, and keeps from the first time on."""
+    try:
+        known: tuple[np.dtype[np.generic], tuple[int, ...]] = array.layout_of_numbers
+    except AttributeError:
+        known = np.dtype(to_numpy_type(array.dtype)), (*array.shape, *array.element_shape)
+        array.layout_of_numbers = known
+    return known
 
 
 def _address(array: ti.Ndarray) -> ctypes.c_uint64:

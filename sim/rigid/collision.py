@@ -276,9 +276,11 @@ class CollisionDetector:
         fill(self._near.pairs, pairs)
         fill(self._near.before, before.astype(np.int32))
         fill(self._near.budget, budgets)
-        # Of Knuth's multiplicative hash.
+        # Of Knuth's multiplicative hash. What never moves is counted from the end: other bodies change no order.
+        of_hash = pairs.copy()
+        of_hash[:, 1] += np.where(pairs[:, 1] < self._moving, 0, (1 << BODY_BITS) - 1 - self._domain)
         rank = np.empty(count, dtype=np.int32)
-        rank[np.argsort(_keys_of(pairs).astype(np.uint64) * HASH)] = np.arange(count)
+        rank[np.argsort(_keys_of(of_hash).astype(np.uint64) * HASH)] = np.arange(count)
         fill(self._near.rank, rank)
         self._is_renewed = True
 

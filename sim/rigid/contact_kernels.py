@@ -15,9 +15,10 @@ FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its lim
 
 
 NORMAL, TANGENT, ARM, OWN = 0, 3, 9, 15
-LEAST, LOWEST, FRICTION, IMPULSE, CHANGE, AHEAD = 21, 22, 23, 24, 27, 30
-"""Columns of what a contact is while its island is solved: arms are two, tangents of three numbers too."""
-COLUMNS = 33
+LEAST, LOWEST, FRICTION, IMPULSE, CHANGE, AHEAD, SLIP = 21, 22, 23, 24, 27, 30, 33
+"""Columns of what a contact is while its island is solved: arms are two, tangents of three numbers too; OWN is what it
+has of A: nn, 1 / nn, n1, n2, 11, 22. SLIP is κ of `friction_impulse`, from which the next sweep starts."""
+COLUMNS = 34
 Work = ti.types.ndarray(dtype=ti.types.vector(COLUMNS, ti.f64), ndim=1)
 Ahead = ti.types.ndarray(dtype=ti.types.vector(12, ti.f64), ndim=1)
 
@@ -135,11 +136,26 @@ def gather_contact(
     ease: Eases,
     work: Work,
 ):
-    """Put together what a contact of two bodies is, its own block of A among it: nn, n1, n2, 11, 12, 22.
+    """Put together what a contact of two bodies is, its own block of A among it, with tangents in which 12 is 0.
 
     Impulses to start from, in world axes, push, and stay within friction.
     """
     first, second = tangents_of(normal)
+    block = ti.Matrix.zero(ti.f64, 3, 3)
+    for side in ti.static(range(2)):
+        body = one if ti.static(side == 0) else two
+        if ease[body][0] > 0.0:
+            arm = arm_one if ti.static(side == 0) else arm_two
+            for row in ti.static(range(3)):
+                axis = normal if ti.static(row == 0) else (first if ti.static(row == 1) else second)
+                answer = ease[body][0] * axis + tensor_times(ease[body], arm.cross(axis)).cross(arm)
+                for column in ti.static(range(row, 3)):
+                    other = normal if ti.static(column == 0) else (first if ti.static(column == 1) else second)
+                    block[row, column] += answer.dot(other)
+    half, mean = 0.5 * (block[1, 1] - block[2, 2]), 0.5 * (block[1, 1] + block[2, 2])
+    spread, angle = ti.sqrt(half * half + block[1, 2] * block[1, 2]), 0.5 * ti.atan2(block[1, 2], half)
+    c, s = ti.cos(angle), ti.sin(angle)
+    first, second = c * first + s * second, c * second - s * first
     along = Vector3(ti.max(start.dot(normal), 0.0), start.dot(first), start.dot(second))
     rubbing, limit = ti.sqrt(along[1] * along[1] + along[2] * along[2]), friction * along[0]
     if rubbing > limit:
@@ -150,58 +166,43 @@ def gather_contact(
         work[at][TANGENT + 3 + axis] = second[axis]
         work[at][ARM + axis], work[at][ARM + 3 + axis] = arm_one[axis], arm_two[axis]
         work[at][IMPULSE + axis], work[at][CHANGE + axis], work[at][AHEAD + axis] = along[axis], 0.0, 0.0
-    work[at][LEAST], work[at][LOWEST], work[at][FRICTION] = least, 0.0, friction
-    block = ti.Vector.zero(ti.f64, 6)
-    for side in ti.static(range(2)):
-        body = one if ti.static(side == 0) else two
-        if ease[body][0] > 0.0:
-            arm = arm_one if ti.static(side == 0) else arm_two
-            for row in ti.static(range(3)):
-                axis = normal if ti.static(row == 0) else (first if ti.static(row == 1) else second)
-                answer = ease[body][0] * axis + tensor_times(ease[body], arm.cross(axis)).cross(arm)
-                for column in ti.static(range(row, 3)):
-                    other = normal if ti.static(column == 0) else (first if ti.static(column == 1) else second)
-                    block[ti.static(entry_of(row, column))] += answer.dot(other)
-    for entry in ti.static(range(6)):
-        work[at][OWN + entry] = block[entry]
-
-
-def entry_of(row: int, column: int) -> int:
-    """Place of an entry among those of the upper half of a symmetric matrix of three rows."""
-    return 3 * row - row * (row - 1) // 2 + column - row
+    work[at][LEAST], work[at][LOWEST], work[at][FRICTION], work[at][SLIP] = least, 0.0, friction, 0.0
+    work[at][OWN], work[at][OWN + 1] = block[0, 0], 1.0 / block[0, 0]
+    work[at][OWN + 2] = c * block[0, 1] + s * block[0, 2]
+    work[at][OWN + 3] = c * block[0, 2] - s * block[0, 1]
+    work[at][OWN + 4], work[at][OWN + 5] = mean + spread, mean - spread
 
 
 @ti.func
-def friction_impulse(a_11: ti.f64, a_12: ti.f64, a_22: ti.f64, c_1: ti.f64, c_2: ti.f64, limit: ti.f64):
-    """Tangential impulses x with slip w = A x + c: w = 0, or |x| = limit and w = -κ x with κ > 0.
+def friction_impulse(a_1: ti.f64, a_2: ti.f64, c_1: ti.f64, c_2: ti.f64, limit: ti.f64, start: ti.f64):
+    """Tangential impulses x with slip w = A x + c: w = 0, or |x| = limit and w = -κ x with κ > 0; and κ.
 
-    The second solves (A + κ) x = -c; Newton's method on 1/limit = 1/|x(κ)|, which is nearly linear in κ, approaches
-    its root from below (Conn, Gould & Toint 2000, "Trust-region methods", 7.3).
+    The second solves (A + κ) x = -c; Newton's method on 1/limit = 1/|x(κ)|, which is nearly linear in κ and concave,
+    is below its root after a step from anywhere, and then approaches it (Conn, Gould & Toint 2000, "Trust-region
+    methods", 7.3). A is diagonal, its first number the larger one. κ is started from.
     """
-    x_1, x_2 = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    x_1, x_2, kappa = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), start
     if limit > 0.0:
-        kappa, square = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        most = limit * limit * (1.0 + ti.cast(FRICTION_ROUNDING, ti.f64))
-        is_found = False
+        square, of_limit, is_found = ti.cast(0.0, ti.f64), limit * limit, False
+        rounding = ti.cast(FRICTION_ROUNDING, ti.f64) * of_limit
         for _ in range(MAX_FRICTION_STEPS):
-            d_11, d_22 = a_11 + kappa, a_22 + kappa
-            determinant = d_11 * d_22 - a_12 * a_12
-            x_1, x_2 = (a_12 * c_2 - d_22 * c_1) / determinant, (a_12 * c_1 - d_11 * c_2) / determinant
+            d_1, d_2 = a_1 + kappa, a_2 + kappa
+            over = 1.0 / (d_1 * d_2)
+            x_1, x_2 = -c_1 * d_2 * over, -c_2 * d_1 * over
             square = x_1 * x_1 + x_2 * x_2
-            if square <= most:
+            if square <= of_limit + rounding and (kappa == 0.0 or square >= of_limit - rounding):
                 is_found = True
                 break
             # -x·dx/dκ = x·(A + κ)⁻¹x
-            fall = (d_22 * x_1 * x_1 - 2.0 * a_12 * x_1 * x_2 + d_11 * x_2 * x_2) / determinant
-            before, kappa = kappa, kappa + (ti.sqrt(square) / limit - 1.0) * square / fall
+            fall = (d_2 * x_1 * x_1 + d_1 * x_2 * x_2) * over
+            before, kappa = kappa, ti.max(kappa + (ti.sqrt(square) / limit - 1.0) * square / fall, 0.0)
             if before == 0.0:
-                # From below as well: |x| is at least |c| over κ and the larger eigenvalue of A.
-                spread = ti.sqrt(0.25 * (a_11 - a_22) * (a_11 - a_22) + a_12 * a_12)
-                kappa = ti.max(kappa, ti.sqrt(c_1 * c_1 + c_2 * c_2) / limit - 0.5 * (a_11 + a_22) - spread)
+                # From below as well: |x| is at least |c| over κ and the larger number of A.
+                kappa = ti.max(kappa, ti.sqrt(c_1 * c_1 + c_2 * c_2) / limit - a_1)
         if not is_found:
             scale = limit / ti.sqrt(square)
             x_1, x_2 = scale * x_1, scale * x_2
-    return x_1, x_2
+    return x_1, x_2, kappa
 
 
 @func
@@ -248,7 +249,7 @@ def relax_pair(
         own = linear_one + angular_one.cross(arm_one) - linear_two - angular_two.cross(arm_two)
         ahead_n = ratio * work[at][AHEAD]
         old_n = work[at][IMPULSE] + ahead_n
-        new_n = ti.max(old_n - (own.dot(normal) - work[at][LEAST]) / work[at][OWN], work[at][LOWEST])
+        new_n = ti.max(old_n - (own.dot(normal) - work[at][LEAST]) * work[at][OWN + 1], work[at][LOWEST])
         d_n = new_n - old_n
         work[at][AHEAD], work[at][CHANGE], work[at][IMPULSE] = ahead_n + work[at][CHANGE], d_n, new_n
         added = d_n * normal
@@ -260,13 +261,15 @@ def relax_pair(
             d_1, d_2 = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             if work[at][FRICTION] > 0.0 and (new_n != 0.0 or old_1 != 0.0 or old_2 != 0.0):
                 # Slip without the tangential impulses of this contact.
-                a_11, a_12, a_22 = work[at][OWN + 3], work[at][OWN + 4], work[at][OWN + 5]
+                a_1, a_2 = work[at][OWN + 4], work[at][OWN + 5]
                 one_way, other_way = vector_of(work, at, TANGENT), vector_of(work, at, TANGENT + 3)
-                c_1 = own.dot(one_way) + work[at][OWN + 1] * d_n - a_11 * old_1 - a_12 * old_2
-                c_2 = own.dot(other_way) + work[at][OWN + 2] * d_n - a_12 * old_1 - a_22 * old_2
-                new_1, new_2 = friction_impulse(a_11, a_12, a_22, c_1, c_2, work[at][FRICTION] * new_n)
+                c_1 = own.dot(one_way) + work[at][OWN + 2] * d_n - a_1 * old_1
+                c_2 = own.dot(other_way) + work[at][OWN + 3] * d_n - a_2 * old_2
+                limit = work[at][FRICTION] * new_n
+                new_1, new_2, kappa = friction_impulse(a_1, a_2, c_1, c_2, limit, work[at][SLIP])
+                work[at][SLIP] = kappa
                 d_1, d_2 = new_1 - old_1, new_2 - old_2
-                largest = ti.max(largest, a_11 * ti.abs(d_1), a_22 * ti.abs(d_2))
+                largest = ti.max(largest, a_1 * ti.abs(d_1), a_2 * ti.abs(d_2))
                 square += d_1 * d_1 + d_2 * d_2
                 added += d_1 * one_way + d_2 * other_way
             work[at][AHEAD + 1], work[at][AHEAD + 2] = (
@@ -275,10 +278,11 @@ def relax_pair(
             )
             work[at][CHANGE + 1], work[at][CHANGE + 2] = d_1, d_2
             work[at][IMPULSE + 1], work[at][IMPULSE + 2] = old_1 + d_1, old_2 + d_2
-        linear_one += ease_one[0] * added
-        angular_one += tensor_times(ease_one, arm_one.cross(added))
-        linear_two -= ease_two[0] * added
-        angular_two -= tensor_times(ease_two, arm_two.cross(added))
+        if added[0] != 0.0 or added[1] != 0.0 or added[2] != 0.0:
+            linear_one += ease_one[0] * added
+            angular_one += tensor_times(ease_one, arm_one.cross(added))
+            linear_two -= ease_two[0] * added
+            angular_two -= tensor_times(ease_two, arm_two.cross(added))
     if ease_one[0] > 0.0:
         for axis in ti.static(range(3)):
             velocity[one][axis], velocity[one][3 + axis] = linear_one[axis], angular_one[axis]

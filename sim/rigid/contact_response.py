@@ -35,7 +35,7 @@ from sim.rigid.pile import Pile
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
-SEPARATION_TIME_S, LARGEST_SEPARATION = 0.02, 0.2  # in which overlaps decay, and by what share a step at most
+SEPARATION_TIME_S, LARGEST_SEPARATION = 0.01, 0.2  # in which overlaps decay, and by what share a step at most
 SLOP = 1.0e-6  # overlap that stays [m]: below what anybody sees, above what rounding makes
 MOST_ROUNDS = 50  # of impacts in a step; after them what still approaches no longer bounces
 WEIGHT_TOLERANCE = 1.0e-4  # of the speed that gravity gives in a step: what the last sweep may still change
@@ -74,9 +74,10 @@ class Outcome:
 class ContactResponse:
     """Resolves the contacts of a step, starting from the forces of the step before; gravity is in m/s².
 
+    Contacts that neither bounce nor are of parts nor have joints, or what deforms, beside them are solved by a `Pile`.
+
     Attributes:
-        in_colours: whether contacts that neither bounce nor are of parts nor have joints, or what deforms, beside them
-            are solved by a `Pile`, many side by side: on GPUs, where islands would be solved by a thread each.
+        in_colours: whether it solves them many side by side: on GPUs, where islands would be solved by a thread each.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
@@ -109,8 +110,12 @@ class ContactResponse:
             return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still, np.zeros((0, 3)))
         if self.in_colours is None:
             self.in_colours = runs_on_gpu()
-        needs_islands = step is not None or carried is not None or bool(self._surfaces.restitution.any())
-        if self.in_colours and not needs_islands and isinstance(detector, CollisionDetector):
+        if (
+            step is None
+            and carried is None
+            and isinstance(detector, CollisionDetector)
+            and not self._bounce_in(detector)
+        ):
             return self._resolve_pile(detector, bodies, dt, ease)
         contacts = detector.contacts()
         links = NO_LINKS if step is None else step.system.links()
@@ -168,10 +173,17 @@ class ContactResponse:
             impacts.impulses + solution.impulses,
         )
 
+    def _bounce_in(self, detector: CollisionDetector) -> bool:
+        """Whether any of the contacts may bounce."""
+        if not self._surfaces.restitution.any():
+            return False
+        contacts = detector.contacts()
+        return bool(self._surfaces.of_pairs(contacts.first, contacts.second)[1].any())
+
     def _resolve_pile(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Outcome:
         from sim.rigid.pile_kernels import Limits
 
-        self._pile = self._pile or Pile(detector, len(bodies))
+        self._pile = self._pile or Pile(detector, len(bodies), in_colours=bool(self.in_colours))
         n = len(bodies)
         velocity = np.zeros((n + 1, 6))
         velocity[:n, :3], velocity[:n, 3:] = bodies.velocity, bodies.angular_velocity

@@ -1,4 +1,4 @@
-"""Contacts of many bodies, solved where they are: on the device, pairs of bodies in colours side by side."""
+"""Contacts of many bodies, solved where they are: on the device, islands or, on GPUs, pairs in colours side by side."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.host_access import copied, put, viewed
+from sim.core.reductions import runs_on_gpu
+from sim.core.scheduling import LEAST_RUN
 from sim.rigid import pile_kernels as kernels
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import FEWEST_ITERATIONS, MAX_ITERATIONS
@@ -28,13 +30,14 @@ class Pile:
         converged: whether all islands did that may take all sweeps.
     """
 
-    def __init__(self, detector: CollisionDetector, moving: int) -> None:
-        """Take so many bodies that move."""
-        self._detector, self._rows = detector, moving + 1
+    def __init__(self, detector: CollisionDetector, moving: int, *, in_colours: bool) -> None:
+        """Take so many bodies that move; islands are solved by a thread each unless their pairs get colours."""
+        self._detector, self._rows, self._in_colours = detector, moving + 1, in_colours
         self._of_bodies: dict[str, Any] | None = None
         self._work: ti.Ndarray | None = None
         self._colours: ti.Ndarray | None = None
         self._pairs: ti.Ndarray | None = None
+        self._by_rank: ti.Ndarray | None = None
         self.sweeps, self.converged = 0, True
         self.touched = np.zeros(moving + 1, dtype=np.int32)
 
@@ -53,22 +56,12 @@ class Pile:
         put(pile.velocity, velocity)
         put(pile.friction, np.append(friction, -1.0))
         kernels.begin_pile(count, near, contacts, pile)
-        while kernels.colour_pairs(count, near, contacts, pile):
-            pass
-        total = kernels.sort_pairs(count, near, contacts, pile, limits)
-        kernels.gather_pile(total, near, contacts, bodies, placed, pile, limits)
-        colours = np.flatnonzero(np.diff(copied(pile.first)))
-        for colour in colours.tolist():
-            kernels.start_colour(colour, near, contacts, pile)
-        for solve in range(2):
-            for sweep in range(limits.most + 1):
-                kernels.begin_sweeps(solve, sweep, pile, limits, self._alive)
-                if sweep in LOOKS and not copied(self._alive)[solve, sweep]:
-                    break
-                for colour in colours[:: 1 if sweep % 2 == 0 else -1].tolist():
-                    kernels.relax_colour(solve, sweep, colour, near, contacts, pile)
-            if solve == 0:
-                kernels.finish_pairs(total, near, contacts, placed, pile, limits)
+        where = (near, contacts, bodies, placed, pile, limits)
+        if self._in_colours:
+            self._solve_in_colours(count, *where)
+        else:
+            islands = kernels.sort_islands(count, near, contacts, pile, limits)
+            kernels.solve_islands(islands, 1 if runs_on_gpu() else LEAST_RUN, *where)
         islands: NDArray[np.int64] = viewed(pile.islands)
         taken, most = islands[:, kernels.TAKEN : kernels.TAKEN + 2], islands[:, kernels.MOST]
         self.sweeps = int(np.minimum(taken, limits.most).max(axis=0).sum())
@@ -76,16 +69,39 @@ class Pile:
         self.touched = viewed(pile.touched).astype(np.int32)
         return viewed(pile.velocity).copy(), viewed(pile.extra).copy()
 
+    def _solve_in_colours(
+        self, count: int, near: Any, contacts: Any, bodies: Any, placed: Any, pile: Any, limits: kernels.Limits
+    ) -> None:
+        while kernels.colour_pairs(count, near, contacts, pile):
+            pass
+        total = kernels.sort_pairs(count, near, contacts, pile, limits)
+        kernels.gather_pile(total, near, contacts, bodies, placed, pile, limits)
+        colours = int(copied(pile.turn)[2])
+        kernels.start_colour.repeat(colours, near, contacts, pile)
+        for solve in range(2):
+            for sweep in range(limits.most + 1):
+                kernels.begin_sweeps(solve, sweep, pile, limits, self._alive)
+                if sweep in LOOKS and not copied(self._alive)[solve, sweep]:
+                    break
+                kernels.relax_colour.repeat(colours, solve, near, contacts, pile)
+            if solve == 0:
+                kernels.finish_pairs(total, near, contacts, placed, pile, limits)
+
     def _tables(self, near: Any, placed: Any, bodies: int) -> kernels.Pile:
         if self._of_bodies is None:
             six, seven, twelve = (ti.types.vector(size, ti.f64) for size in (6, 7, 12))
             rows = self._rows
             self._of_bodies = {
                 "first": ti.ndarray(ti.i32, kernels.COLOURS + 1),
+                "turn": ti.ndarray(ti.i32, 3),
                 "places": ti.ndarray(ti.i32, kernels.COLOURS),
                 "least": ti.ndarray(ti.i32, rows),
                 "masks": ti.ndarray(ti.i32, rows),
                 "group": ti.ndarray(ti.i32, rows),
+                "roots": ti.ndarray(ti.i32, rows),
+                "movers": ti.ndarray(ti.i32, rows),
+                "spans": ti.ndarray(ti.i32, (rows + 1, 2)),
+                "vacant": ti.ndarray(ti.i32, (rows, 2)),
                 "islands": ti.ndarray(ti.i64, (rows, kernels.ISLAND_COLUMNS)),
                 "done": ti.ndarray(ti.i32, (rows, 2)),
                 "ratios": ti.ndarray(ti.f64, rows),
@@ -100,5 +116,8 @@ class Pile:
         length = near.pairs.shape[0]
         self._colours = larger(self._colours, (length,), ti.i32)
         self._pairs = larger(self._pairs, (length,), ti.i32)
+        self._by_rank = larger(self._by_rank, (length,), ti.i32)
         self._work = larger(self._work, (placed.gap.shape[0],), ti.types.vector(kernels.WORK_COLUMNS, ti.f64))
-        return kernels.Pile(colour=self._colours, pairs=self._pairs, work=self._work, **self._of_bodies)
+        return kernels.Pile(
+            colour=self._colours, pairs=self._pairs, by_rank=self._by_rank, work=self._work, **self._of_bodies
+        )

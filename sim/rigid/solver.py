@@ -30,7 +30,7 @@ from sim.rigid.joints import Joints
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.parts import PartsDetector, detector_of
 from sim.rigid.paths import path_of
-from sim.rigid.states import MovingBodies
+from sim.rigid.states import MovingBodies, lengths
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
 from sim.shapes.body_geometry import BodyGeometry
 
@@ -180,7 +180,7 @@ class RigidSolver:
         """
         if self.first_bad_quantity() is not None:
             return 0.0
-        spin = float(np.max(np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1)), initial=0.0))
+        spin = float(np.max(self.bodies.spins(), initial=0.0))
         is_dynamic = self.bodies.is_dynamic
         own_steps = MOST_OWN_STEPS if self.has_own_steps and is_dynamic.any() else 1
         dt = self._largest_dt if spin == 0.0 else min(self._largest_dt, own_steps * LARGEST_TURN / spin)
@@ -450,9 +450,8 @@ class RigidSolver:
 
     def _surface_motion_since(self, position: Array, orientation: Array) -> Array:
         """Upper bound of how far surface points got [m], (n,); a turn by an angle a moves quaternions by 2 sin(a/4)."""
-        moved = np.sqrt(np.square(self.bodies.position - position).sum(axis=1))
-        turned = np.sqrt(np.square(self.bodies.orientation - orientation).sum(axis=1))
-        return moved + 2.0 * turned * self._radius
+        moved = lengths(self.bodies.position - position)
+        return moved + 2.0 * lengths(self.bodies.orientation - orientation) * self._radius
 
     def _surface_speeds(self) -> Array:
         return self.bodies.surface_speeds(self._radius)
@@ -478,7 +477,7 @@ class RigidSolver:
             self.bodies.angular_velocity[number] = rotation.logarithm(turn) / dt
 
     def _stop_lost_bodies(self) -> None:
-        away = np.sqrt(np.square(self.bodies.position - self._domain_centre).sum(axis=1))
+        away = lengths(self.bodies.position - self._domain_centre)
         lost = self.bodies.is_free & (away > LOST_DISTANCE * self._domain_diagonal)
         if lost.any():
             if self.glue is not None:
@@ -610,9 +609,9 @@ class RigidSolver:
     def first_bad_quantity(self) -> str | None:
         """The first body with a value that is no number, or a velocity beyond all reason."""
         for quantity in _STATE[:4]:
-            bad = ~np.isfinite(getattr(self.bodies, quantity)).all(axis=1)
-            if bad.any():
-                return f'{quantity} of "{self.bodies.names[int(np.argmax(bad))]}" is not finite'
+            is_finite = np.isfinite(getattr(self.bodies, quantity))
+            if not is_finite.all():
+                return f'{quantity} of "{self.bodies.names[int(np.argmin(is_finite.all(axis=1)))]}" is not finite'
         speeds = self._surface_speeds()
         fastest = int(np.argmax(speeds))
         if speeds[fastest] > RUNAWAY_SPEED:

@@ -148,11 +148,13 @@ class MovingBodies:
         in_body = np.einsum("nji,nj->ni", turned, self.angular_velocity)
         return np.einsum("nij,nj->ni", turned, np.einsum("njk,nk->nj", self._tensor, in_body))
 
+    def spins(self) -> Array:
+        """How fast bodies turn [rad/s], (n,)."""
+        return lengths(self.angular_velocity)
+
     def surface_speeds(self, radius: Array) -> Array:
         """Upper bounds of the speeds of surface points within a radius [m] of each body [m/s], (n,)."""
-        spin = np.sqrt(np.square(self.angular_velocity).sum(axis=1))
-        speeds: Array = np.sqrt(np.square(self.velocity).sum(axis=1)) + spin * radius + self.deforming
-        return speeds
+        return lengths(self.velocity) + self.spins() * radius + self.deforming
 
     def wake(self, which: NDArray[np.bool_]) -> None:
         """Let bodies, (n,), move again."""
@@ -174,6 +176,12 @@ class MovingBodies:
         self.wake(pushed | angular.any(axis=1))
         self.velocity = self.velocity + self.inverse_mass[:, None] * linear
         self.angular_velocity = self.angular_velocity + np.einsum("nij,nj->ni", self.inverse_inertia(), angular)
+
+
+def lengths(vectors: Array) -> Array:
+    """Of vectors, (n, k), (n,)."""
+    result: Array = np.sqrt(np.einsum("ni,ni->n", vectors, vectors))
+    return result
 
 
 def _principal(tensors: Array) -> tuple[Array, Array]:

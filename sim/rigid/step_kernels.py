@@ -46,17 +46,18 @@ def count_fast(
     for pair in range(count):
         one, two, wall = pairs[pair, 0], pairs[pair, 1], pairs[pair, 2]
         if speeds.is_free[one] == 1 or speeds.is_free[two] == 1:
-            advance, relative = speeds.advance[one], speeds.own[one]
+            advance, relative = speeds.advance[one], speeds.turning[one]
             if wall >= 0:
                 for axis in ti.static(range(3)):
                     if ti.cast(walls[wall, 0], ti.i32) == axis:
                         height = walls[wall, 1] * (pose[one, axis] - walls[wall, 2])
+                        relative += ti.abs(speeds.velocity[one, axis])
                         advance = ti.max(advance, 0.5 * (height - speeds.radius[one]))
             else:
                 slower, faster = ti.min(speeds.own[one], speeds.own[two]), ti.max(speeds.own[one], speeds.own[two])
                 advance = ti.min(advance, speeds.advance[two])
                 advance *= 1.0 + slower / ti.max(faster, ti.cast(1.0e-30, ti.f64))
-                relative = speeds.turning[one] + speeds.turning[two]
+                relative += speeds.turning[two]
                 apart = Vector3(0.0)
                 for axis in ti.static(range(3)):
                     apart[axis] = speeds.velocity[one, axis] - speeds.velocity[two, axis]

@@ -15,7 +15,7 @@ from sim.core.walls import Wall
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Array, Indices
 from sim.rigid.parts import PartsDetector
-from sim.rigid.states import MovingBodies
+from sim.rigid.states import MovingBodies, lengths
 from sim.shapes.body_geometry import BodyGeometry
 
 LARGEST_ADVANCE = 0.25
@@ -65,7 +65,7 @@ class StepChooser:
         """The meetings of active bodies, (n,), within dt [s]; speeds of surfaces [m/s], (n,), their own if omitted."""
         bodies, n = self._bodies, len(self._bodies)
         acceleration = float(np.linalg.norm(self._gravity))
-        spin = np.sqrt(np.square(bodies.angular_velocity).sum(axis=1))
+        spin = bodies.spins()
         own = bodies.surface_speeds(self._radius[:n])
         motion = np.zeros(len(self._edge) + 1)
         motion[:n] = (own if speeds is None else speeds) * dt + 0.5 * acceleration * dt * dt
@@ -75,7 +75,7 @@ class StepChooser:
         velocity = np.concatenate([bodies.velocity, np.zeros((len(self._edge) - n, 3))])
         turning = np.append(spin * self._radius[:n] + bodies.deforming, np.zeros(len(self._edge) - n))
         all_speeds = np.append(own, np.zeros(len(self._edge) - n))
-        relative = np.sqrt(np.square(velocity[first] - velocity[second]).sum(axis=1)) + turning[first] + turning[second]
+        relative = lengths(velocity[first] - velocity[second]) + turning[first] + turning[second]
         slower, faster = np.sort([all_speeds[first], all_speeds[second]], axis=0)
         # The sum of both advances goes by the speed of one against the other.
         advance = np.minimum(self._advance[first], self._advance[second])
@@ -93,14 +93,16 @@ class StepChooser:
             # Who left by an open face falls on, past the edges of the wall.
             meets = bodies.is_dynamic & (height > 0.0) & (aside <= self._radius[:n] + motion[:n])
             advance = np.maximum(self._advance[:n], 0.5 * (height - self._radius[:n]))
-            by_wall = time_of(advance, own, acceleration)
+            # Along a plane it may get as far as it likes.
+            towards = np.abs(bodies.velocity[:, wall.axis]) + spin * self._radius[:n] + bodies.deforming
+            by_wall = time_of(advance, towards, acceleration)
             alone_s = np.where(meets, np.minimum(alone_s, by_wall), alone_s)
         return Meetings(first, second, time_s, alone_s)
 
     def needs_none(self, dt: float) -> bool:
         """Whether a look at the speeds tells that no body may get too far in dt [s], whatever it meets."""
         bodies, n = self._bodies, len(self._bodies)
-        spin = float(np.sqrt(np.square(bodies.angular_velocity).sum(axis=1)).max())
+        spin = float(bodies.spins().max())
         fastest = float(bodies.surface_speeds(self._radius[:n]).max())
         smallest = float(self._advance.min())
         gravity = float(np.linalg.norm(self._gravity))
@@ -135,7 +137,7 @@ class StepChooser:
 
         bodies, n = self._bodies, len(self._bodies)
         acceleration = float(np.linalg.norm(self._gravity))
-        spin = np.sqrt(np.square(bodies.angular_velocity).sum(axis=1))
+        spin = bodies.spins()
         if float(np.max(spin, where=is_free, initial=0.0)) * dt > LARGEST_TURN:
             return False
         still = len(self._edge) + 1 - n
@@ -179,7 +181,7 @@ class StepChooser:
     def _rooms(self, first: Indices, second: Indices, poses: Poses) -> Array:
         """Distances of pairs [m], (k,), at least: of spheres around bodies, or from one to an exact static shape."""
         away = poses.position[first] - poses.position[second]
-        room = np.sqrt(np.square(away).sum(axis=1)) - self._radius[second]
+        room = lengths(away) - self._radius[second]
         for number in np.unique(second[second >= len(self._bodies)]):
             geometry, mine = self._geometries[number], second == number
             if geometry.is_analytic:

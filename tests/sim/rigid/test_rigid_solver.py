@@ -191,11 +191,12 @@ def test_stable_step_shrinks_with_speed_and_spin():
         return in_room(body("a", ball(0.01), (0, 0, height), **motion)).stable_dt()
 
     # A quarter of the radius at 100 m/s; a tenth of a radian at 1000 rad/s. Gravity adds a little to the first.
-    assert step(velocity=(100, 0, 0)) == pytest.approx(0.25 * 0.01 / 100, rel=1e-3)
+    assert step(velocity=(0, 0, -100)) == pytest.approx(0.25 * 0.01 / 100, rel=1e-3)
+    assert step(velocity=(100, 0, 0)) == pytest.approx(2e-3)  # along the floor
     assert step(angular_velocity=(0, 0, 1000)) == pytest.approx(1e-4)
     assert step() == pytest.approx(2e-3)
     # Its box has a radius of 17 mm; half of the way from there to the floor.
-    assert step(0.1, velocity=(100, 0, 0)) == pytest.approx(0.5 * (0.1 - 0.01 * 3**0.5) / 100, rel=1e-3)
+    assert step(0.1, velocity=(0, 0, -100)) == pytest.approx(0.5 * (0.1 - 0.01 * 3**0.5) / 100, rel=1e-3)
 
 
 @pytest.mark.parametrize(
