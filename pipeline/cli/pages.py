@@ -122,7 +122,7 @@ def live(
     loaded = read_own_job(job_file, overrides, preview=preview)
     job = live_job(loaded.job, substeps=substeps)
     loaded, findings = checked(loaded)
-    threads, on_gpu = cores or machine_capacity().cores, resolve_device(job.device) != "cpu"
+    threads, on_gpu = cores or machine_capacity().cores, resolve_device(job.chosen_device) != "cpu"
     if not as_written and substeps is None:
         job = fluent(job, power=computing_power(cores=threads, on_gpu=on_gpu))
     if not anyway:

@@ -97,7 +97,7 @@ class SimulateStage(Stage):
     def preflight(self, job: Job) -> list[str]:
         """A device that does not work here."""
         try:
-            resolve_device(job.device)
+            resolve_device(job.chosen_device)
         except DeviceUnavailableError as error:
             return [str(error)]
         return []
@@ -163,7 +163,7 @@ class _Simulation:
         on_compiled(self._tell_compiling)
         self._folder = context.layout.checkpoints
         make_folder(self._folder, within=context.layout.root)
-        self._device = initialize(context.job.device, threads=context.threads, gpu=context.gpu)
+        self._device = initialize(context.job.chosen_device, threads=context.threads, gpu=context.gpu)
         self._world = world_of(context.job)
         self._checkpointed_at = time.monotonic()
         self._last_checkpoint = -1
@@ -281,7 +281,8 @@ def _resources(job: Job) -> Resources:
 
     A device that does not work here is planned all the same; preflight reports it.
     """
-    device = resolve_device("auto") if job.device == "auto" else job.device
+    chosen = job.chosen_device
+    device = resolve_device(chosen) if chosen == "auto" else chosen
     memory_bytes = WORKER_BYTES + SNAPSHOTS_AT_ONCE * _snapshot_bytes(job)
     return Resources(cores=0) if device == "cpu" else Resources(cores=1, memory_bytes=memory_bytes, gpus=1)
 

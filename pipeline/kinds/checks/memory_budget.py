@@ -42,7 +42,7 @@ class MemoryBudget:
 def memory_budget(job: Job) -> MemoryBudget:
     """Free memory for the job's simulation: that of a GPU if it is Nvidia's, else the machine's."""
     try:
-        device = resolve_device(job.device)
+        device = resolve_device(job.chosen_device)
     except DeviceUnavailableError:
         device = "cpu"
     free = free_gpu_bytes() if device == "cuda" else None

@@ -114,7 +114,7 @@ def require_named_devices(job: Job, stages: Collection[str]) -> None:
 
     Raises PipelineError: one of the stages that are to run leaves its device open.
     """
-    devices = (("device", "simulate", job.device), ("render.device", "render", job.render.device))
+    devices = (("device", "simulate", job.chosen_device), ("render.device", "render", job.render.device))
     names = [name for name, stage, device in devices if stage in stages and device == "auto"]
     if names:
         raise PipelineError(

@@ -67,7 +67,7 @@ def show_live(
         from pipeline.web.live.page import LivePage
 
         try:
-            device = initialize(job.device, threads=threads)
+            device = initialize(job.chosen_device, threads=threads)
             session = Session(job, written=loaded.job, gave_up=gave_up, longest_frame_s=longest_frame_s)
             session.ends = ends
         except DeviceUnavailableError as error:
