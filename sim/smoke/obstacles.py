@@ -227,11 +227,11 @@ def is_solid(solids: Solids, at: ti.i32):
 
 
 @func
-def open_part(solids: Solids, at: ti.i32) -> ti.f32:
-    """Open part of the cell at a flat index now [-]."""
+def part_before(solids: Solids, at: ti.i32) -> ti.f32:
+    """Open part of the cell at a flat index before the last commit, which is that of what it holds until then [-]."""
     part = 1.0
     if ti.static(solids.cuts):
-        part = solids.volume[at]
+        part = solids.before[at]
     return part
 
 

@@ -36,8 +36,8 @@ RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed o
 class SmokeSolver:
     """Density, temperature and velocity of smoke in a box of cells, with solids in it that stand still or move.
 
-    One substep, by operator splitting as in Stam 1999: advect velocity, let obstacles move on, accelerate, project, carry
-    smoke and heat with what came of it, emit, cool. Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
+    One substep, by operator splitting as in Stam 1999: advect velocity, let obstacles move on, accelerate, emit, project, carry
+    smoke and heat with what came of it, cool. Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
 
     Exact, but for rounding: smoke is added by sources and leaves through open sides only, what sources add is counted,
     and heat is kept likewise (`Transport`). Heat lets air rise by the strength of gravity, unless the parameters say how fast, and does not expand it.
@@ -146,15 +146,11 @@ class SmokeSolver:
         self.move_obstacles()
         self._accelerate(dt)
         blow_in(self.air, self.parameters.wind, self.parameters.windward_faces)
-        emitting = [each for each in self.sources if each.parameters.emits_during(self.time_s, self.time_s + dt)]
-        for source in emitting:
-            source.drive(self.time_s, dt)
+        self._emit(dt)
         operator, step = self._projection.multigrid.coefficients.operator, dt / self.grid.cell_size
         brake_inflow(self.air, operator, self._open_sides, self.grid.cells, step)
         self._projections.append(self._projection.project())
         self._transport.advance(step)
-        for source in emitting:
-            self._emitted_mass += source.emit(self.time_s, dt) * self.grid.cell_size**3
         cool(self.air, self.parameters, dt)
         self._extrapolation.fill()
         self.time_s += dt
@@ -270,6 +266,11 @@ class SmokeSolver:
             self._turbulence.accelerate(self.air, self.time_s + 0.5 * dt, dt)
         for force in self.air_forces:
             force.accelerate(dt)
+
+    def _emit(self, dt: float) -> None:
+        for source in self.sources:
+            if source.parameters.emits_during(self.time_s, self.time_s + dt):
+                self._emitted_mass += source.emit(self.time_s, dt) * self.grid.cell_size**3
 
     def _follow_obstacles(self) -> None:
         self._projection.update()

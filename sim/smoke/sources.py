@@ -17,7 +17,7 @@ from sim.core.motion import rotation
 from sim.shapes.placement import build_solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid
-from sim.smoke.obstacles import Air, is_solid, open_part
+from sim.smoke.obstacles import Air, is_solid, part_before
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 from sim.smoke.source_motion import CELLS, SourceMotion, SweptShape, motion_of
 
@@ -109,25 +109,17 @@ class Source:
             return max(map(abs, self.parameters.velocity))
         return math.hypot(*self.parameters.velocity) + self.motion.speed()
 
-    def drive(self, time_s: float, dt: float) -> None:
-        """Go to where it is in a step of dt [s] from a simulated time [s] on, and set the velocity there."""
-        if self.motion is not None:
-            self._move(self.motion, *self.parameters.span_of(time_s, time_s + dt))
-        if self.parameters.velocity is not None:
-            for faces, openness, velocity in zip(
-                self._faces, self._air.openness, self._air.state.velocity, strict=True
-            ):
-                _set_faces(faces.indices, faces.values, openness, velocity, faces.count)
-
     def emit(self, time_s: float, dt: float) -> float:
-        """Bring the cells to the source's values in the step that it drove last.
+        """Bring the fields to the source's values in a step of dt [s] from a simulated time [s] on.
 
         Fluctuation and flicker are functions of place and time alone, so a run that continues sees the same.
 
         Returns:
-            The density added, summed over cells [-].
+            The density added, summed over the air of cells [-].
         """
         begin_s, end_s = self.parameters.span_of(time_s, time_s + dt)
+        if self.motion is not None:
+            self._move(self.motion, begin_s, end_s)
         strength = self.parameters.largest_strength(begin_s, end_s) * self._steadiness(end_s)
         blocks = -(-max(1, self._cells.count) // BLOCK)
         if self._emitted.shape[0] < blocks:
@@ -136,6 +128,11 @@ class Source:
         targets = ti.math.vec2(strength * self.target_density, strength * self.target_excess)
         is_hot, count = self.target_excess >= 0.0, self._cells.count
         _raise_cells(self._air, self._cells.indices, count, noise, targets, is_hot, blocks, self._emitted)
+        if self.parameters.velocity is not None:
+            for faces, openness, velocity in zip(
+                self._faces, self._air.openness, self._air.state.velocity, strict=True
+            ):
+                _set_faces(faces.indices, faces.values, openness, velocity, faces.count)
         return float(copied(self._emitted)[:blocks].sum(dtype=np.float64))
 
     def _stay(self) -> None:
@@ -186,7 +183,7 @@ def _raise_cells(
                 before = density[at]
                 after = ti.max(before, targets[0])
                 density[at] = after
-                emitted += open_part(air.solids, at) * (after - before)
+                emitted += part_before(air.solids, at) * (after - before)
                 target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * targets[1]
                 excess[at] = ti.max(excess[at], target) if ti.static(is_hot) else ti.min(excess[at], target)
         added[block] = emitted
