@@ -27,22 +27,23 @@ if TYPE_CHECKING:
 REACH_IN_SPACINGS = (
     2.0  # least half-width of a particle's weight: a lone one fills an eighth of its place, without holes
 )
-WATER = 0.5  # fraction of water at a flat surface
+WATER = 0.5  # fraction of water above which a cell is water: where a flat surface cuts the cell's centre
 NEVER = 1.0e30  # time in which weightless particles at rest get anywhere [s]
 FRACTION_QUANTUM = 2.0**-20  # unit of the sums of volume fractions [-]; they hold up to 2048
 MOMENTUM_QUANTUM = 2.0**-40  # unit of the sums of volume fraction times velocity [m/s]; they hold up to 8e6
+BEYOND = 1.0e9  # more than any fraction; products of three are still finite
 LEAST_ROOM = 0.125  # least part of the weight that counts as free: in the corner of a tank it is that
 
 
 @bundle
 class Sums(NamedTuple):
-    """Water at the corners of the cells of a smoke, flat; integers, so that their order does not matter."""
+    """Water in the cells of a smoke, flat; integers, so that their order does not matter."""
 
     fraction: Integers  # of volume, in units of `FRACTION_QUANTUM`
     momentum_x: LongIntegers  # volume fraction times velocity, in units of `MOMENTUM_QUANTUM`
     momentum_y: LongIntegers
     momentum_z: LongIntegers
-    inside: Floats  # part of the weight at a corner that walls and static bodies leave (`room_for_water`)
+    inside: Floats  # part of the weight at a cell's centre that walls and static bodies leave
 
 
 @bundle
@@ -59,17 +60,16 @@ class Reach(NamedTuple):
 class SmokeFluidCoupling(Coupling):
     """Air cannot enter water, and moves with its surface.
 
-    A coupled step of the smoke: the fluid takes its own, shorter steps; then the corners of cells are marked with
-    the velocity of the water there, and the smoke steps around it. One way: water does not feel
-    air, which weighs a thousandth of it.
+    A coupled step of the smoke: the fluid takes its own, shorter steps; then the cells that hold water are marked as
+    obstacles with the velocity of the water in them, as wholes, and the smoke steps around them. One way: water does
+    not feel air, which weighs a thousandth of it.
 
-    The volume fraction of water at a corner of cells is
+    The volume fraction of water at the centre of a cell is
 
         phi = sum_i d³ prod_a w((x - x_i)_a / R) / R,   w(q) = max(0, 1 - |q|),
 
-    with R twice the spacing d of particles, or a cell's edge if that is longer: then it is a mean over the
-    cells around. For a lattice of particles it is 1 inside, and 1/2 on a flat surface, from which the distance is
-    (1/2 - phi) R close by. What it lacks
+    with R twice the spacing d of particles, or a cell's edge if that is longer: then it is a mean over the cell and
+    half of each of its neighbours. For a lattice of particles it is 1 inside, and 1/2 on a flat surface. What it lacks
     beside closed faces of the domain and static bodies is made up for by dividing by the part of the weight that is
     free of them. A lone drop
     blocks no air, nor does a sheet of one layer of particles; two layers do where cells are as fine as particles.
@@ -106,10 +106,10 @@ class SmokeFluidCoupling(Coupling):
         return time_s if time_s < NEVER else math.inf
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
-        """Mark the corners about water, after the steps of the fluid."""
+        """Mark the cells that hold water now, after the steps of the fluid."""
         box, marks = self._smoke.obstacles.box, self._smoke.obstacles.marks
         _splat(self._reach, box, self._sums, self._fluid.particles.arrays)
-        _mark_water(box, self._sums, self._reach.in_cells, marks)
+        _mark_water(box, self._sums, marks)
 
 
 @kernel
@@ -129,18 +129,18 @@ def _find_shortest_time(reach: Reach, gravity: ti.f32, particles: Particles, sho
 
 @kernel
 def _splat(reach: Reach, box: Grid, sums: Sums, particles: Particles):
-    """Add every particle to the corners that it reaches, in sums that begin at zero."""
+    """Add every particle to the cells whose centres it reaches, in sums that begin at zero."""
     for at in range(sums.fraction.shape[0]):
         sums.fraction[at] = 0
         for momentum in ti.static((sums.momentum_x, sums.momentum_y, sums.momentum_z)):
             momentum[at] = ti.cast(0, ti.i64)
     for n in range(particles.count):
-        corners, width = cell_counts(box) + 1, reach.in_cells
-        # In cells, such that corner i, counted from 1, is at i.
-        x_n = (particles.position[n] - reach.low) / reach.cell_size + 1.0
-        if (x_n > 1.0 - width).all() and (x_n < ti.cast(corners, ti.f32) + width).all():
+        cells, width = cell_counts(box), reach.in_cells
+        # In cells, such that the centre of cell i, counted from 1, is at i.
+        x_n = (particles.position[n] - reach.low) / reach.cell_size + 0.5
+        if (x_n > 1.0 - width).all() and (x_n < ti.cast(cells, ti.f32) + width).all():
             low = ti.max(ti.cast(ti.floor(x_n - width), ti.i32) + 1, 1)
-            high = ti.min(ti.cast(ti.ceil(x_n + width), ti.i32) - 1, corners)
+            high = ti.min(ti.cast(ti.ceil(x_n + width), ti.i32) - 1, cells)
             for i in range(low[0], high[0] + 1):
                 weight_x = reach.volume * (1.0 - ti.abs(float(i) - x_n[0]) / width)
                 for j in range(low[1], high[1] + 1):
@@ -155,54 +155,42 @@ def _splat(reach: Reach, box: Grid, sums: Sums, particles: Particles):
 
 
 @kernel
-def _mark_water(box: Grid, sums: Sums, reach_in_cells: ti.f32, marks: Marks):
-    """Mark the corners within reach of water."""
+def _mark_water(box: Grid, sums: Sums, marks: Marks):
+    """Mark the corners of the cells that are water: on their surface, or inside where all cells around are."""
     for i, j in ti.ndrange((1, box.nx + 2), (1, box.ny + 2)):
         for k in range(1, box.nz + 2):
-            at = row_start(box, i, j) + k
-            fraction = ti.cast(sums.fraction[at], ti.f32) * FRACTION_QUANTUM
-            if fraction > 0.0:
-                momentum = ti.Vector(
-                    [
-                        ti.cast(sums.momentum_x[at], ti.f32),
-                        ti.cast(sums.momentum_y[at], ti.f32),
-                        ti.cast(sums.momentum_z[at], ti.f32),
-                    ]
-                )
-                beyond = -sums.inside[at]
-                distance = (WATER - fraction / ti.max(sums.inside[at], LEAST_ROOM)) * reach_in_cells
-                distance = ti.select(beyond > 0.0, beyond, distance)
-                mark(marks, at, distance, momentum * (MOMENTUM_QUANTUM / fraction))
+            beside, count, velocity = 0, 0, ti.math.vec3(0.0)
+            for di, dj, dk in ti.static(ti.ndrange(2, 2, 2)):
+                x, y, z = i - di, j - dj, k - dk
+                if 0 < x <= box.nx and 0 < y <= box.ny and 0 < z <= box.nz:
+                    beside += 1
+                    at = row_start(box, x, y) + z
+                    fraction = ti.cast(sums.fraction[at], ti.f32) * FRACTION_QUANTUM
+                    if fraction > WATER * sums.inside[at]:
+                        count += 1
+                        for axis, momentum in ti.static(enumerate((sums.momentum_x, sums.momentum_y, sums.momentum_z))):
+                            velocity[axis] += ti.cast(momentum[at], ti.f32) * (MOMENTUM_QUANTUM / fraction)
+            if count > 0:
+                distance = ti.select(count == beside, -1.0, 0.0)
+                mark(marks, row_start(box, i, j) + k, distance, velocity / float(count))
 
 
 def room_for_water(grid: SmokeGrid, domain: DomainParameters, reach: float) -> NDArray[np.float64]:
-    """Part of the weight prod_a max(0, 1 - |q_a|) at each corner that walls and static bodies leave, (nx + 1, ..).
+    """Part of the weight prod_a max(0, 1 - |q_a|) at each cell's centre that walls and static bodies leave, `cells`.
 
-    Where a corner is beyond a wall, minus its distance from there [cells]. The half-width of the weight along an axis is
-    `reach` [m].
+    Walls count exactly, bodies about as they fill cells. `BEYOND` where a centre is beyond a wall. The half-width of
+    the weight along an axis is `reach` [m].
     """
     x, y, z = (parts_inside(grid, domain, reach, axis) for axis in range(3))
-    room: NDArray[np.float64] = x[:, None, None] * y[None, :, None] * z[None, None, :]
+    room: NDArray[np.float64] = x[:, None, None].astype(np.float64) * y[None, :, None] * z[None, None, :]
+    is_beyond = room >= BEYOND * LEAST_ROOM
     if grid.has_solids:
-        middle = grid.cell_centres().reshape(*grid.cells, 3)
-        beyond = np.maximum(*_beyond_walls(middle, domain)).max(axis=-1) > 0.0
-        solid = np.where(beyond, 0.0, _solid_parts(grid))  # what is behind a wall is missing already
+        solid = np.where(is_beyond, 0.0, _solid_parts(grid))  # what is behind a wall is missing already
         weights = cell_weights(reach / grid.cell_size)
         for axis in range(3):
             solid = _weighted_sum(solid, weights, axis)
         room = np.maximum(room - solid, LEAST_ROOM)
-    axes = [low + np.arange(n + 1) * grid.cell_size for low, n in zip(grid.origin, grid.cells, strict=True)]
-    corners = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    way = np.maximum(*_beyond_walls(corners, domain)).max(axis=-1) / grid.cell_size
-    return np.where(way > ROUNDING, -way, room)
-
-
-def _beyond_walls(points: NDArray[np.float64], domain: DomainParameters) -> list[NDArray[np.float64]]:
-    """How far points, (.., 3), are beyond the lower and the upper closed faces of the domain [m], negative inside."""
-    ways = domain.min - points, points - np.asarray(domain.max)
-    for way, side in zip(ways, "-+", strict=True):
-        way[..., [f"{axis}{side}" in domain.open_faces for axis in "xyz"]] = -np.inf
-    return list(ways)
+    return np.where(is_beyond, BEYOND, room)
 
 
 def _solid_parts(grid: SmokeGrid) -> NDArray[np.float64]:
@@ -216,31 +204,35 @@ def _solid_parts(grid: SmokeGrid) -> NDArray[np.float64]:
 
 
 def cell_weights(reach_in_cells: float) -> NDArray[np.float64]:
-    """Integrals of the weight max(0, 1 - |x| / R) / R over the cells -n..n - 1 around a corner; their sum is 1."""
-    last = math.ceil(reach_in_cells)
-    edges = np.clip(np.arange(-last, last + 1) / reach_in_cells, -1.0, 1.0)
+    """Integrals of the weight max(0, 1 - |x| / R) / R over the cells -n..n around a centre; their sum is 1."""
+    last = math.ceil(reach_in_cells + 0.5) - 1
+    edges = np.clip((np.arange(-last, last + 2) - 0.5) / reach_in_cells, -1.0, 1.0)
     weights: NDArray[np.float64] = np.diff(edges - 0.5 * edges * np.abs(edges))
     return weights
 
 
 def _weighted_sum(values: NDArray[np.float64], weights: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Of the cells around each corner along an axis; nothing is beyond the array."""
-    half = len(weights) // 2
-    padding = [(half, half) if a == axis else (0, 0) for a in range(3)]
+    """Of the neighbours along an axis; nothing is beyond the array."""
+    last = len(weights) // 2
+    padding = [(last, last) if a == axis else (0, 0) for a in range(3)]
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, padding), len(weights), axis=axis)
     total: NDArray[np.float64] = windows @ weights
     return total
 
 
-def parts_inside(grid: SmokeGrid, domain: DomainParameters, reach: float, axis: int) -> NDArray[np.float64]:
-    """Part of the weight max(0, 1 - |q|) along an axis that lies within the domain's closed faces, by corner, (n,)."""
-    corners = grid.origin[axis] + np.arange(grid.cells[axis] + 1) * grid.cell_size
-    parts = np.ones(len(corners))
+def parts_inside(grid: SmokeGrid, domain: DomainParameters, reach: float, axis: int) -> NDArray[np.float32]:
+    """Part of the weight max(0, 1 - |q|) along an axis that lies within the domain's closed faces, by cell, (n,).
+
+    `BEYOND` where a cell's centre is beyond a closed face: no fraction of water makes it water.
+    """
+    centres = grid.origin[axis] + (np.arange(grid.cells[axis]) + 0.5) * grid.cell_size
+    parts, is_beyond = np.ones(len(centres)), np.zeros(len(centres), bool)
     for face, distance in (
-        (f"{'xyz'[axis]}-", corners - domain.min[axis]),
-        (f"{'xyz'[axis]}+", domain.max[axis] - corners),
+        (f"{'xyz'[axis]}-", centres - domain.min[axis]),
+        (f"{'xyz'[axis]}+", domain.max[axis] - centres),
     ):
         if face not in domain.open_faces:
             parts -= 0.5 * (1.0 - np.clip(distance / reach, 0.0, 1.0)) ** 2
+            is_beyond |= distance < 0.0
     # In a domain narrower than the reach at least half of it is inside: the two halves of the weight overlap.
-    return np.maximum(parts, 0.5)
+    return np.where(is_beyond, BEYOND, np.maximum(parts, 0.5)).astype(np.float32)

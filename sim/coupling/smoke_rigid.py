@@ -43,8 +43,8 @@ class SmokeRigidCoupling(Coupling):
     deforms.
 
     One way: bodies do not feel the air. Its density is a thousandth of theirs, and a smoke of constant density has no
-    pressure in pascals to give. The smoke takes its own steps; before each, bodies go ahead to its end, and the corners of
-    cells about them there are marked.
+    pressure in pascals to give. The smoke takes its own steps; before each, bodies go ahead to its end, and the corners
+    of cells about them there are marked.
 
     Steps are cut so that no body gets farther than a cell within the box: along its path if it is kinematic, with its
     velocity and gravity if it is dynamic; one outside has the way to the box to go first. What collisions, water and

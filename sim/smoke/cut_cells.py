@@ -1,16 +1,16 @@
 """Cut cells: how much of each cell, and of each of its faces, solids leave to the air (Ng, Min & Gibou 2009).
 
 Solids are known by their signed distances at the corners of cells. Between corners, the middles of faces and those of
-cells, which have the means of their corners, the distance is linear: a cell is 24 tetrahedra, a face four triangles, and
-their parts outside of the solids are exact where a surface is plane. Both follow a solid that moves without jumps.
+cells, which have the means of their corners, the distance is linear: a cell is 24 tetrahedra, a face four triangles,
+and their parts outside of the solids are exact where a surface is plane. Both follow a solid that moves without jumps.
 
 Two kinds of cells are closed as a whole:
 
 * *Split* ones, whose corners in the air are not connected along the edges of the cell: a wall runs through, and a cell
   has one pressure and one smoke. A wall of normal n and thickness d, at least cell_size * max |n_i|, has a point of
   every edge that crosses it, so that cells of its two sides never touch through an open face.
-* Those of which less than `LEAST_VOLUME` is open and that have no open face to one with more: what flows through them in
-  a step is more than they hold. All others below it share what they hold with the largest neighbour, their *keeper*.
+* Those of which less than `LEAST_VOLUME` is open and that have no open face to one with more: what flows through
+  them in a step is more than they hold. All others below it share what they hold with the largest neighbour, their *keeper*.
 """
 
 import taichi as ti
@@ -24,15 +24,15 @@ FAR = 2.0  # distances from solids count up to here [cells]
 ROUNDING = 2.0**-13  # distances below this are 0 [cells]: a solid that ends where cells do cuts none
 LEAST_VOLUME = 0.125  # of a cell that holds its smoke alone: whatever way a plane turns, some neighbour has a sixth
 
-# What a cell has to do with smaller ones, by the lowest bits of its word; the others stand at the direction of a keeper.
-ALONE, KEEPER, KEPT = 0, 7, range(1, 7)
+# What a cell has to do with smaller ones, by the lowest bits of its word: 1 .. 6 is the direction of its own keeper.
+ALONE, KEEPER = 0, 7
 NEAR_SOLIDS = 8  # bit of a word: less than all of the cell or of a neighbour is open
 CHANGES = 16  # bit of a word: the open part of the cell or of a neighbour has just changed
 
 
 @ti.pyfunc
 def is_split(outside: ti.template()):
-    """Whether corners of a cell, a bit each (4 dx + 2 dy + dz), are not connected along its edges; in kernels as well."""
+    """Whether corners of a cell, a bit each (4 dx + 2 dy + dz), are not connected along its edges; also in kernels."""
     reached = outside & -outside
     for _ in range(4):  # a way along edges between two of eight corners that has no shortcut has four at most
         along_z = ((reached & 0x55) << 1) | ((reached & 0xAA) >> 1)
@@ -40,6 +40,21 @@ def is_split(outside: ti.template()):
         along_x = ((reached & 0x0F) << 4) | ((reached & 0xF0) >> 4)
         reached = (reached | along_z | along_y | along_x) & outside
     return reached != outside
+
+
+@func
+def _sorted(a: ti.f32, b: ti.f32, c: ti.f32, d: ti.f32):
+    low, p, q, high = ti.min(a, b), ti.max(a, b), ti.min(c, d), ti.max(c, d)
+    low, q = ti.min(low, q), ti.max(low, q)
+    p, high = ti.min(p, high), ti.max(p, high)
+    return low, ti.min(p, q), ti.max(p, q), high
+
+
+@func
+def _mean(a: ti.f32, b: ti.f32, c: ti.f32, d: ti.f32) -> ti.f32:
+    """The same to the bit in whatever order, however a compiler orders sums."""
+    low, p, q, high = _sorted(a, b, c, d)
+    return 0.25 * ((low + high) + (p + q))
 
 
 @func
@@ -60,10 +75,7 @@ def _open_triangle(a: ti.f32, b: ti.f32, c: ti.f32) -> ti.f32:
 @func
 def _open_tetrahedron(a: ti.f32, b: ti.f32, c: ti.f32, d: ti.f32) -> ti.f32:
     """Part of a tetrahedron in which a linear function with these values at its corners is positive."""
-    low, p, q, high = ti.min(a, b), ti.max(a, b), ti.min(c, d), ti.max(c, d)
-    low, q = ti.min(low, q), ti.max(low, q)
-    p, high = ti.min(p, high), ti.max(p, high)
-    p, q = ti.min(p, q), ti.max(p, q)
+    low, p, q, high = _sorted(a, b, c, d)
     part = 1.0
     if high <= 0.0:
         part = 0.0
@@ -86,9 +98,9 @@ def open_area(distance: Floats, at: ti.i32, first: ti.i32, second: ti.i32) -> ti
     if ti.min(ti.min(a, b), ti.min(c, d)) <= 0.0:
         area = 0.0
         if ti.max(ti.max(a, b), ti.max(c, d)) > 0.0:
-            middle = 0.25 * ((a + b) + (c + d))
-            along = _open_triangle(middle, a, b) + _open_triangle(middle, c, d)
-            area = 0.25 * (along + (_open_triangle(middle, a, c) + _open_triangle(middle, b, d)))
+            middle = _mean(a, b, c, d)
+            low, high = _open_triangle(middle, a, b), _open_triangle(middle, c, d)
+            area = _mean(low, high, _open_triangle(middle, a, c), _open_triangle(middle, b, d))
     return area
 
 
@@ -108,13 +120,12 @@ def open_volume(distance: Floats, at: ti.i32, step_x: ti.i32, step_y: ti.i32) ->
         volume = 0.0
         if high > 0.0 and not is_split(outside):
             for axis in range(3):
-                pair = 0.0
                 along = ti.select(axis == 0, step_x, ti.select(axis == 1, step_y, 1))
                 first = ti.select(axis == 0, step_y, step_x)
                 second = ti.select(axis == 2, step_y, 1)
-                for side in range(2):
-                    pair += _open_pyramid(distance, at, along, first, second, side)
-                volume += pair
+                below = _open_pyramid(distance, at, along, first, second, 0)
+                above = _open_pyramid(distance, at, along, first, second, 1)
+                volume += ti.min(below, above) + ti.max(below, above)
             volume /= 6.0
     return volume
 
@@ -124,13 +135,15 @@ def _open_pyramid(distance: Floats, at: ti.i32, along: ti.i32, first: ti.i32, se
     """Open part of the sixth of a cell between its middle and one of its faces."""
     face, beyond = at + side * along, at + (1 - side) * along
     a, b, c, d = distance[face], distance[face + first], distance[face + second], distance[face + first + second]
-    top = 0.25 * ((a + b) + (c + d))
-    other = 0.25 * (
-        (distance[beyond] + distance[beyond + first]) + (distance[beyond + second] + distance[beyond + first + second])
+    top, diagonal = _mean(a, b, c, d), beyond + first + second
+    other = _mean(distance[beyond], distance[beyond + first], distance[beyond + second], distance[diagonal])
+    middle = 0.5 * (ti.min(top, other) + ti.max(top, other))
+    return _mean(
+        _open_tetrahedron(middle, top, a, b),
+        _open_tetrahedron(middle, top, c, d),
+        _open_tetrahedron(middle, top, a, c),
+        _open_tetrahedron(middle, top, b, d),
     )
-    middle = 0.5 * (top + other)
-    edges = _open_tetrahedron(middle, top, a, b) + _open_tetrahedron(middle, top, c, d)
-    return 0.25 * (edges + (_open_tetrahedron(middle, top, a, c) + _open_tetrahedron(middle, top, b, d)))
 
 
 @func
@@ -143,7 +156,7 @@ def way(box: Grid, direction: ti.i32) -> ti.i32:
 def keeper_of(word: ti.i32, at: ti.i32, box: Grid) -> ti.i32:
     """The cell that keeps what a cell of this word holds: it does itself unless it is small."""
     code, keeper = word & 7, at
-    if code != ALONE and code != KEEPER:
+    if code > ALONE and code < KEEPER:
         keeper += way(box, code - 1)
     return keeper
 
@@ -186,13 +199,13 @@ def find_keepers(
                     is_inside = (here[axis] < cell_counts(box)[axis]) if ti.static(upward == 1) else (here[axis] > 1)
                     # Others may close `there` meanwhile, but only where it is small.
                     if is_inside and volume[there] >= LEAST_VOLUME:
-                        if volume[there] > largest:
-                            if open_area(distance, face, steps(box)[first], steps(box)[second]) > 0.0:
-                                largest, word = volume[there], direction + 1
+                        along, across = steps(box)[first], steps(box)[second]
+                        if volume[there] > largest and open_area(distance, face, along, across) > 0.0:
+                            largest, word = volume[there], direction + 1
                         if ti.static(moving):
-                            if before[at] > 0.0 and before[there] > 0.0 and volume[there] > largest_before:
-                                if open_area(distance_before, face, steps(box)[first], steps(box)[second]) > 0.0:
-                                    largest_before, word_before = volume[there], direction + 1
+                            was_air = before[at] > 0.0 and before[there] > 0.0 and volume[there] > largest_before
+                            if was_air and open_area(distance_before, face, along, across) > 0.0:
+                                largest_before, word_before = volume[there], direction + 1
                 # What is open now depends on what is now alone.
                 if word == ALONE or volume[at] == 0.0:
                     volume[at], word = 0.0, word_before
@@ -231,16 +244,15 @@ def measure_areas(
     extra_x, extra_y, extra_z = ti.static(int(axis == 0), int(axis == 1), int(axis == 2))
     for i, j, lane in ti.ndrange((1, box.nx + 1 + extra_x), (1, box.ny + 1 + extra_y), box.lanes):
         for n in range(lane_items(box, box.nz + extra_z, lane)):
-            k = lane_place(box, n, lane)
-            at, p = row_start(box, i, j) + k, ti.Vector([i, j, k])[axis]
-            part = _area_between(axis, box, distance, volume, at, p)
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            part = _area_between(axis, box, distance, volume, at)
             if ti.static(moving):
-                part = 0.5 * (part + _area_between(axis, box, distance_before, before, at, p))
+                part = 0.5 * (part + _area_between(axis, box, distance_before, before, at))
             area[at] = part
 
 
 @func
-def _area_between(axis: ti.template(), box: Grid, distance: Floats, volume: Floats, at: ti.i32, p: ti.i32) -> ti.f32:
+def _area_between(axis: ti.template(), box: Grid, distance: Floats, volume: Floats, at: ti.i32) -> ti.f32:
     """Open part of the face before the p-th cell along an axis; none beside a cell that is closed."""
     first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
     part = open_area(distance, at, steps(box)[first], steps(box)[second])

@@ -20,7 +20,7 @@ from sim.smoke.obstacles import Obstacles, Solids, flux_part
 
 KNOWN = 0  # layer of faces with a value of their own: those that are open in part, and sides of the box
 NOWHERE, DEEP = 254, 255  # layers of what is not in the grid, and of what lies deeper in a solid than the last layer
-FLAT = 1.0e-3  # slope of the distance below which a place has no nearest surface [cells per cell]
+FLAT = 1.0e-3  # slope of the distance below which a place is deep inside, and moves with its solid [cells per cell]
 
 
 class Extrapolation:
@@ -161,7 +161,7 @@ def _constrained_face(axis: ti.template(), box: Grid, solids: Solids, velocity: 
     if ti.static(solids.moving):
         for component, speed in ti.static(enumerate((solids.velocity.x, solids.velocity.y, solids.velocity.z))):
             wall[component] = 0.25 * ((speed[at] + speed[at + a]) + (speed[at + b] + speed[at + a + b]))
-    length, result = slope.norm(), flow[axis]
+    length, result = slope.norm(), wall[axis]
     if length > FLAT:
         normal = slope / length
         # The normal parts one by one: along an axis the solid's velocity is taken to the bit.

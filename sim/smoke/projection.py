@@ -5,9 +5,10 @@ conductance c, and A q = -h div u. The residual of that equation is then minus h
 the solver stops by what is asked for: max|div u| h / max|u|.
 
 Where solids cut cells the open part A of a face counts, and with it its conductance; its velocity is that in the open
-part (Batty, Bertails & Bridson 2007; Ng, Min & Gibou 2009). What moves with the velocity u_solid on the closed part drives
-the air: the flux through a face is A u + (1 - A) u_solid. A closed region has a solution only if no volume flows into it in sum. What obstacles press into it all the
-same, as a piston does, is spread evenly over its air: it is compressed, or expands, at the same rate everywhere.
+part (Batty, Bertails & Bridson 2007; Ng, Min & Gibou 2009). What moves with the velocity u_solid on the closed part
+drives the air: the flux through a face is A u + (1 - A) u_solid. A closed region has a solution only if no volume flows
+into it in sum. What obstacles press into it all the same, as a piston does, is spread evenly over its air: it is
+compressed, or expands, at the same rate everywhere.
 
 Flexible conjugate gradients (Notay 2000) because the preconditioner is not symmetric. When the recursion has reached
 its goal the velocity is corrected and its divergence measured anew; if rounding kept it above the goal, another solve

@@ -1,8 +1,8 @@
 """Regions of air that no open side ends: pressure cannot change how much air flows into one of them.
 
-Regions are the connected components of cells with air in them through open faces, found on the device by joining trees of neighbours (Komura 2015;
-Playne & Hawick 2018): each cell points to one of a lower index, and the root of a component is its lowest cell,
-whatever order threads take. Sums over a region are integers, exact and so the same in any order.
+Regions are the connected components of cells with air in them through open faces, found on the device by joining trees
+of neighbours (Komura 2015; Playne & Hawick 2018): each cell points to one of a lower index, and the root of a component
+is its lowest cell, whatever order threads take. Sums over a region are integers, exact and so the same in any order.
 """
 
 import math

@@ -36,17 +36,19 @@ RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed o
 class SmokeSolver:
     """Density, temperature and velocity of smoke in a box of cells, with solids in it that stand still or move.
 
-    One substep, by operator splitting as in Stam 1999: advect velocity, let obstacles move on, accelerate, emit, project, carry
-    smoke and heat with what came of it, cool. Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
+    One substep, by operator splitting as in Stam 1999: advect velocity, let obstacles move on, accelerate, emit,
+    project, carry smoke and heat with what came of it, cool. Incompressible air of constant density (Boussinesq): smoke
+    and heat act through buoyancy alone.
 
     Exact, but for rounding: smoke is added by sources and leaves through open sides only, what sources add is counted,
-    and heat is kept likewise (`Transport`). Heat lets air rise by the strength of gravity, unless the parameters say how fast, and does not expand it.
+    and heat is kept likewise (`Transport`). Heat lets air rise by the strength of gravity, unless the parameters say
+    how fast, and does not expand it.
 
     Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`sim.smoke.sides`).
 
-    Solids cut cells (`cut_cells`), and those that move push air with the velocity of their surface (`Obstacles`): what is
-    in a cell that they cover goes where it is pushed. Beside them smoke is kept to second order of the step, so `mass`
-    is a measured quantity.
+    Solids cut cells (`cut_cells`), and those that move push air with the velocity of their surface (`Obstacles`): what
+    is in a cell that they cover goes where it is pushed. Beside them smoke is kept to second order of the step, so
+    `mass` is a measured quantity.
 
     In a closed region sources drive air, but do not add any; nor do bodies that are wholly inside. What a piston
     presses into it is spread evenly (`PressureProjection`): its air is compressed, and its smoke with it.
@@ -223,9 +225,9 @@ class SmokeSolver:
     def diagnostics(self) -> Diagnostics:
         """Totals of the state, and the projections of the frame.
 
-        `mass` and `emitted_mass` are integrals of density over the open parts of cells [m³]; `iterations` is the sum over the frame,
-        `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame. Where obstacles may move
-        there is also `compression` [1/s], the worst of the frame (`ProjectionReport`).
+        `mass` and `emitted_mass` are integrals of density over the open parts of cells [m³]; `iterations` is the sum
+        over the frame, `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame. Where
+        obstacles may move there is also `compression` [1/s], the worst of the frame (`ProjectionReport`).
         """
         speed, _ = self._find_speed_and_acceleration()
         volume = self.obstacles.open_volume().astype(np.float64)

@@ -1,10 +1,10 @@
 """Whether the cells of a smoke are fine enough for the walls of a body: air passes between the corners that it holds.
 
-A wall of normal n and thickness d holds a corner of every row of them along the axis of its largest |n_i|, and thus lets
-no air through (`cut_cells`), if d is at least cell_size * max |n_i|; of a thinner one a part of these rows has none,
-unless it happens to lie along a layer of corners. That part is what is
-measured here, at points of the surface. Beside an edge that is sharper than 45 degrees off a plate's two sides, such as
-the rim of a cone, a body is thin as well; cells only blunt it, and what they miss there does not count.
+A wall of normal n and thickness d holds a corner of every row of them along the axis of its largest |n_i|, and thus
+lets no air through (`cut_cells`), if d is at least cell_size * max |n_i|; of a thinner one a part of these rows has
+none, unless it happens to lie along a layer of corners. That part is what is measured here, at points of the surface.
+Beside an edge that is sharper than 45 degrees off a plate's two sides, such as the rim of a cone, a body is thin as
+well; cells only blunt it, and what they miss there does not count.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def thin_walls(
 ) -> ThinWalls:
     """What a smoke's cells miss of a body that stands still in its box.
 
-    What lies on a closed side counts as seen, and so does what has a corner in another body, which stands still as well,
-    right beside it.
+    What lies on a closed side counts as seen, and so does what has a corner in another body, which stands still as
+    well, right beside it.
     """
     low, high = (np.asarray(corner) for corner in smoke.corners(domain))
     # A face that lies in a side of the box, but for round-off, is not in it.
@@ -124,8 +124,8 @@ def _has_corner(
 def _row(solids: Sequence[Solid], points: Points, inwards: Points, low: Points, cell_size: float) -> NDArray[np.bool_]:
     """Whether a body holds one of the two corners next to each point, along the axis of its largest |n_i|, (n,).
 
-    The row goes through the point, not through corners: the rim of a plate, of which cells cut off up to their width, is
-    not missed. Bodies may lie beside each other; cells have a corner at `low` [m], (3,).
+    The row goes through the point, not through corners: the rim of a plate, of which cells cut off up to their width,
+    is not missed. Bodies may lie beside each other; cells have a corner at `low` [m], (3,).
     """
     found = np.zeros(len(points), bool)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))

@@ -15,8 +15,8 @@ of a cloud alike and do not shift it; limited corrections of cells, as MacCormac
 Cells that solids cut have a part V of their volume, and parts A of their faces: A u flows through, and a cell holds V
 times its density. Small cells share what they hold with their keeper (`sim.smoke.cut_cells`) after each walk. Where
 solids move the air that has flowed out of a cell, sum A u dt/h, is not the change of V to the last bit: it is counted,
-V - sum A u dt/h, and smoke has the density that it has in that air; so even smoke stays even, and what is in a cell that
-is covered goes to its keeper. Beside solids the moments across axes and the third ones are left.
+V - sum A u dt/h, and smoke has the density that it has in that air; so even smoke stays even, and what is in a cell
+that is covered goes to its keeper. Beside solids the moments across axes and the third ones are left.
 """
 
 import math
@@ -27,7 +27,7 @@ from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_floats
-from sim.smoke.cut_cells import ALONE, CHANGES, KEEPER, LEAST_VOLUME, NEAR_SOLIDS, keeper_of, way
+from sim.smoke.cut_cells import CHANGES, KEEPER, LEAST_VOLUME, NEAR_SOLIDS, keeper_of, way
 from sim.smoke.lanes import cell_counts, fill_row, fill_rows, lane_items, lane_place, row_start, steps
 from sim.smoke.obstacles import Air, Solids, flux_part
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
@@ -100,7 +100,7 @@ def _largest_outflow(air: Air, step: ti.f32, rows: Rows) -> Pair:
                         if (solids.words[there] & 7) == ti.static((direction ^ 1) + 1):
                             given += step * _outflow(air, there)
                             held += _held(solids, there)
-                is_counted = (code == ALONE or code == KEEPER) and held > 0.0
+                is_counted = keeper_of(code, at, box) == at and held > 0.0
                 given = ti.select(is_counted, given / ti.max(held, ti.static(LEAST_VOLUME)), 0.0)
             largest = ti.max(largest, given)
         rows.partial[partial_place(box, i, j, lane)] = ti.Vector([largest, 0.0])
@@ -179,6 +179,13 @@ def _drain(air: Air, room: Floats, step: ti.f32):
                 room[at] -= step * lost
 
 
+@ti.func
+def _in_range(density: ti.f32, low: ti.f32, high: ti.f32, size: ti.f32, before: ti.f32, word: ti.i32) -> ti.f32:
+    """Density beside solids that have moved: none that was not around, and that of before where no air tells it."""
+    bounded = ti.max(low, ti.min(high, density)) if size > LEAST_ROOM else before
+    return bounded if (word & CHANGES) != 0 else density
+
+
 @kernel
 def _keep(air: Air, held: Floats, values: Floats, room: Floats, volume: Floats, spread: Floats):
     """Density of what cells hold, the same in small ones and their keepers."""
@@ -199,8 +206,7 @@ def _keep(air: Air, held: Floats, values: Floats, room: Floats, volume: Floats, 
                         size += room[there]
             density = amount / ti.max(size, LEAST_ROOM)
             if ti.static(solids.moving):
-                if (solids.words[keeper] & CHANGES) != 0:
-                    density = ti.max(low, ti.min(high, density)) if size > LEAST_ROOM else values[keeper]
+                density = _in_range(density, low, high, size, values[keeper], solids.words[keeper])
             spread[at] = density if volume[at] > 0.0 else 0.0
 
 
