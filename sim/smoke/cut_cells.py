@@ -10,7 +10,8 @@ Two kinds of cells are closed as a whole:
   has one pressure and one smoke. A wall of normal n and thickness d, at least cell_size * max |n_i|, has a point of
   every edge that crosses it, so that cells of its two sides never touch through an open face.
 * Those of which less than `LEAST_VOLUME` is open and that have no open face to one with more: what flows through
-  them in a step is more than they hold. All others below it share what they hold with the largest neighbour, their *keeper*.
+  them in a step is more than they hold. All others below it share what they hold with the
+  largest neighbour, their *keeper*.
 """
 
 import taichi as ti
