@@ -112,8 +112,6 @@ _KNOWN = {
         Quantity("elastic_energy", "elastic energy", "J", _ENERGY),
         Quantity("mass", "mass", "kg", _MASS),
         Quantity("emitted_mass", "emitted", "kg", _MASS),
-        Quantity("covered_mass", "covered by obstacles", "kg", _MASS),
-        Quantity("uncovered_mass", "left by obstacles", "kg", _MASS),
         *(Quantity(f"momentum_{axis}", f"momentum {axis}", "kg m/s", _MOMENTUM) for axis in "xyz"),
         *(Quantity(f"angular_momentum_{axis}", f"angular momentum {axis}", "kg m²/s", _ANGULAR) for axis in "xyz"),
     )

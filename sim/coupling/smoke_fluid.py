@@ -15,7 +15,8 @@ from sim.core.launch import kernel
 from sim.core.solver import Coupling
 from sim.fluid.particles import Particles
 from sim.smoke.arrays import new_floats
-from sim.smoke.grid import SmokeGrid
+from sim.smoke.cut_cells import ROUNDING
+from sim.smoke.grid import SmokeGrid, cell_corners
 from sim.smoke.lanes import Grid, cell_counts, row_start
 from sim.smoke.obstacles import Marks, mark
 
@@ -60,8 +61,8 @@ class SmokeFluidCoupling(Coupling):
     """Air cannot enter water, and moves with its surface.
 
     A coupled step of the smoke: the fluid takes its own, shorter steps; then the cells that hold water are marked as
-    obstacles with the velocity of the water in them, and the smoke steps around them. One way: water does not feel
-    air, which weighs a thousandth of it.
+    obstacles with the velocity of the water in them, as wholes, and the smoke steps around them. One way: water does
+    not feel air, which weighs a thousandth of it.
 
     The volume fraction of water at the centre of a cell is
 
@@ -70,7 +71,7 @@ class SmokeFluidCoupling(Coupling):
     with R twice the spacing d of particles, or a cell's edge if that is longer: then it is a mean over the cell and
     half of each of its neighbours. For a lattice of particles it is 1 inside, and 1/2 on a flat surface. What it lacks
     beside closed faces of the domain and static bodies is made up for by dividing by the part of the weight that is
-    free of them, of static bodies as the cells have them. A lone drop
+    free of them. A lone drop
     blocks no air, nor does a sheet of one layer of particles; two layers do where cells are as fine as particles.
 
     Steps are cut so that no particle gets farther than a cell within its reach of the box, with its velocity and
@@ -155,38 +156,51 @@ def _splat(reach: Reach, box: Grid, sums: Sums, particles: Particles):
 
 @kernel
 def _mark_water(box: Grid, sums: Sums, marks: Marks):
-    """Mark the cells that are water."""
-    for i, j in ti.ndrange((1, box.nx + 1), (1, box.ny + 1)):
-        for k in range(1, box.nz + 1):
-            at = row_start(box, i, j) + k
-            fraction = ti.cast(sums.fraction[at], ti.f32) * FRACTION_QUANTUM
-            if fraction > WATER * sums.inside[at]:
-                momentum = ti.Vector(
-                    [
-                        ti.cast(sums.momentum_x[at], ti.f32),
-                        ti.cast(sums.momentum_y[at], ti.f32),
-                        ti.cast(sums.momentum_z[at], ti.f32),
-                    ]
-                )
-                mark(marks, at, momentum * (MOMENTUM_QUANTUM / fraction))
+    """Mark the corners of the cells that are water: on their surface, or inside where all cells around are."""
+    for i, j in ti.ndrange((1, box.nx + 2), (1, box.ny + 2)):
+        for k in range(1, box.nz + 2):
+            beside, count, velocity = 0, 0, ti.math.vec3(0.0)
+            for di, dj, dk in ti.static(ti.ndrange(2, 2, 2)):
+                x, y, z = i - di, j - dj, k - dk
+                if 0 < x <= box.nx and 0 < y <= box.ny and 0 < z <= box.nz:
+                    beside += 1
+                    at = row_start(box, x, y) + z
+                    fraction = ti.cast(sums.fraction[at], ti.f32) * FRACTION_QUANTUM
+                    if fraction > WATER * sums.inside[at]:
+                        count += 1
+                        for axis, momentum in ti.static(enumerate((sums.momentum_x, sums.momentum_y, sums.momentum_z))):
+                            velocity[axis] += ti.cast(momentum[at], ti.f32) * (MOMENTUM_QUANTUM / fraction)
+            if count > 0:
+                distance = ti.select(count == beside, -1.0, 0.0)
+                mark(marks, row_start(box, i, j) + k, distance, velocity / float(count))
 
 
 def room_for_water(grid: SmokeGrid, domain: DomainParameters, reach: float) -> NDArray[np.float64]:
     """Part of the weight prod_a max(0, 1 - |q_a|) at each cell's centre that walls and static bodies leave, `cells`.
 
-    Walls count exactly, bodies as the cells that they fill. `BEYOND` where a centre is beyond a wall. The half-width of
+    Walls count exactly, bodies about as they fill cells. `BEYOND` where a centre is beyond a wall. The half-width of
     the weight along an axis is `reach` [m].
     """
     x, y, z = (parts_inside(grid, domain, reach, axis) for axis in range(3))
     room: NDArray[np.float64] = x[:, None, None].astype(np.float64) * y[None, :, None] * z[None, None, :]
     is_beyond = room >= BEYOND * LEAST_ROOM
-    solid = np.where(is_beyond, 0.0, grid.solid)  # what is behind a wall is missing already
-    if solid.any():
+    if grid.has_solids:
+        solid = np.where(is_beyond, 0.0, _solid_parts(grid))  # what is behind a wall is missing already
         weights = cell_weights(reach / grid.cell_size)
         for axis in range(3):
             solid = _weighted_sum(solid, weights, axis)
         room = np.maximum(room - solid, LEAST_ROOM)
     return np.where(is_beyond, BEYOND, room)
+
+
+def _solid_parts(grid: SmokeGrid) -> NDArray[np.float64]:
+    """About how much of each cell static bodies fill."""
+    inside, total = np.zeros(grid.cells), np.zeros(grid.cells)
+    for corner in range(8):
+        distance = cell_corners(grid.distance, corner)
+        inside += np.maximum(-distance, 0.0)
+        total += np.abs(distance)
+    return np.where(grid.solid, 1.0, inside / np.maximum(total, ROUNDING))
 
 
 def cell_weights(reach_in_cells: float) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import numpy as np
 import taichi as ti
 
 from sim.core.arrays import Matrices, Vectors
-from sim.core.bundles import bundle, func
+from sim.core.bundles import bundle
 from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.motion.paths import ArcLength, Path
@@ -20,6 +20,10 @@ from sim.smoke.obstacles import Marks, mark, time_of_travel
 if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
     from sim.smoke.solver import SmokeSolver
+
+MARGIN = (
+    1.5  # beyond a body's box in which corners are marked: those of all cells that it cuts, whatever rounding [cells]
+)
 
 
 @bundle
@@ -39,8 +43,8 @@ class SmokeRigidCoupling(Coupling):
     deforms.
 
     One way: bodies do not feel the air. Its density is a thousandth of theirs, and a smoke of constant density has no
-    pressure in pascals to give. The smoke takes its own steps; before each, bodies go ahead to its end, and the cells
-    whose centres are inside of them there are marked.
+    pressure in pascals to give. The smoke takes its own steps; before each, bodies go ahead to its end, and the corners
+    of cells about them there are marked.
 
     Steps are cut so that no body gets farther than a cell within the box: along its path if it is kinematic, with its
     velocity and gravity if it is dynamic; one outside has the way to the box to go first. What collisions, water and
@@ -97,7 +101,7 @@ class SmokeRigidCoupling(Coupling):
         return known[1]
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
-        """Mark the cells that the bodies fill at the end of a step of the smoke of dt [s]."""
+        """Mark the corners about the bodies at the end of a step of the smoke of dt [s]."""
         bodies, grid, obstacles = self._rigid.bodies, self._smoke.grid, self._smoke.obstacles
         turned = bodies.rotation()
         self._shapes.deform(self._rigid.time_s, 1.0)
@@ -111,37 +115,14 @@ class SmokeRigidCoupling(Coupling):
         for number, geometry in enumerate(self._rigid.solids):
             half, middle = 0.5 * np.ptp(geometry.bounds, axis=0), geometry.bounds.mean(axis=0)
             centre, reach = bodies.position[number] + turned[number] @ middle, np.abs(turned[number]) @ half
-            # Cells from 1 whose centres lie in the body's box.
-            first = np.ceil((centre - reach - grid.origin) / grid.cell_size + 0.5)
-            last = np.floor((centre + reach - grid.origin) / grid.cell_size + 0.5)
-            low = [int(n) for n in np.clip(first, 1, np.add(grid.cells, 1))]
-            high = [int(n) for n in np.clip(last, 0, grid.cells)]
+            # Corners from 1 in the body's box and `MARGIN` beyond.
+            first = np.ceil((centre - reach - grid.origin) / grid.cell_size + 1.0 - MARGIN)
+            last = np.floor((centre + reach - grid.origin) / grid.cell_size + 1.0 + MARGIN)
+            low = [int(n) for n in np.clip(first, 1, np.add(grid.cells, 2))]
+            high = [int(n) for n in np.clip(last, 0, np.add(grid.cells, 1))]
             if all(begin <= end for begin, end in zip(low, high, strict=True)):
                 window = ti.math.ivec3(low), ti.math.ivec3(high), ti.math.vec3(grid.origin), grid.cell_size
                 _mark_body(number, *window, obstacles.box, obstacles.marks, self._bodies)
-
-
-@func
-def deforming_velocity(place: ti.math.vec3, body: ti.i32, cell_size: ti.f32, bodies: Bodies) -> ti.math.vec3:
-    """Velocity by which a cell of a body, about a place in its frame, moves as the body deforms.
-
-    Components are those on the faces to air, where they act: what spreads is faster there than half a cell deeper, and
-    a growing body would push less air than it gains. Rigid motions do not change along their own direction.
-    """
-    velocity = ti.math.vec3(0.0)
-    turned = bodies.rotation[body]
-    for axis in ti.static(range(3)):
-        way = ti.math.vec3(0.0)
-        for column in ti.static(range(3)):
-            way[column] = cell_size * turned[axis, column]
-        shift = 0.0
-        for side in range(2):
-            sign = 1.0 - 2.0 * float(side)
-            if distance_to(place + sign * way, body, bodies.shapes) >= 0.0:
-                shift += 0.5 * sign
-        moved = surface_motion(place + shift * way, body, bodies.shapes)
-        velocity[axis] = (turned @ moved)[axis]
-    return velocity
 
 
 @kernel
@@ -155,14 +136,14 @@ def _mark_body(
     marks: Marks,
     bodies: Bodies,
 ):
-    """Mark the cells from `low` to `high` whose centres lie in a body."""
+    """Mark the corners from `low` to `high`."""
     for i, j in ti.ndrange((low[0], high[0] + 1), (low[1], high[1] + 1)):
         for k in range(low[2], high[2] + 1):
-            centre = origin + cell_size * (ti.Vector([float(i), float(j), float(k)]) - 0.5)
-            arm = centre - bodies.position[body]
+            corner = origin + cell_size * (ti.Vector([float(i), float(j), float(k)]) - 1.0)
+            arm = corner - bodies.position[body]
             place = bodies.rotation[body].transpose() @ arm + bodies.centre_of_mass[body]
-            if distance_to(place, body, bodies.shapes) < 0.0:
-                velocity = bodies.velocity[body] + bodies.spin[body].cross(arm)
-                if ti.static(bodies.shapes.deforms):
-                    velocity += deforming_velocity(place, body, cell_size, bodies)
-                mark(marks, row_start(box, i, j) + k, velocity)
+            velocity = bodies.velocity[body] + bodies.spin[body].cross(arm)
+            if ti.static(bodies.shapes.deforms):
+                velocity += bodies.rotation[body] @ surface_motion(place, body, bodies.shapes)
+            distance = distance_to(place, body, bodies.shapes) / cell_size
+            mark(marks, row_start(box, i, j) + k, distance, velocity)

@@ -17,7 +17,6 @@ from sim.smoke.arrays import Faces
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid, cell_counts, fill_row, lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air
-from sim.smoke.transport import Transport
 
 FAR = 1.0e9  # beyond every box [cells]
 
@@ -32,11 +31,10 @@ class Outside(NamedTuple):
 
 
 class Advection:
-    """Advects cell and face values of one grid.
+    """Advects the velocity of one grid.
 
-    Cells: `Transport`. Faces: what is carried in through an open side has along it the velocity of the air outside;
-    across it that on the side itself, which the pressure gives it. Beyond walls everything has the value of the nearest
-    place inside.
+    What is carried in through an open side has along it the velocity of the air outside; across it that on the side
+    itself, which the pressure gives it. Beyond walls everything has the value of the nearest place inside.
     """
 
     def __init__(
@@ -51,17 +49,16 @@ class Advection:
         """Take the air of a grid, six arrays to work in, and the velocity of the air outside [m/s]."""
         self._air, self._cells_per_metre = air, 1.0 / grid.cell_size
         self._predicted, self._corrected = Faces(*work[:3]), Faces(*work[3:])
-        self._maccormack, self._cells = maccormack, Transport(air, work, sharpens=maccormack)
+        self._maccormack = maccormack
         low = (1.0 if grid.lets_in(axis, 0) else -FAR for axis in range(3))
         high = (float(n) if grid.lets_in(axis, 1) else FAR for axis, n in enumerate(grid.cells))
         self._outside = Outside(ti.math.vec3(*low), ti.math.vec3(*high), ti.math.vec3(wind))
 
     def advance(self, dt: float) -> None:
-        """Advect everything by dt [s] with the present velocity."""
+        """Advect by dt [s] with the present velocity."""
         step = dt * self._cells_per_metre
         box, outside, state = self._air.box, self._outside, self._air.state
         predicted, corrected = self._predicted, self._corrected
-        self._cells.advance(step)
         for axis in range(3):
             _predict_faces(axis, box, outside, state.velocity, predicted[axis], step)
         if self._maccormack:

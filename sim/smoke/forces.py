@@ -10,7 +10,7 @@ from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.smoke.arrays import Faces
 from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start, steps
-from sim.smoke.obstacles import Air, face_velocity
+from sim.smoke.obstacles import Air, flux_part
 from sim.smoke.parameters import SmokeParameters
 
 TINY_GRADIENT = 1.0e-6  # keeps N = eta / (|eta| + tiny) finite where the vorticity is even [1/(m s)]
@@ -28,7 +28,7 @@ def accelerate(
 ) -> None:
     """Add dt [s] times f = (-alpha rho + beta (T - T_air)) up + epsilon h (N x omega) to the velocity of open faces.
 
-    On closed faces air moves as the solid behind them does. Of gravity only the direction matters, as alpha and beta
+    Sides of the box that are closed are at rest. Of gravity only the direction matters, as alpha and beta
     are accelerations. The confinement is evaluated at cell centres, three cells and more away from the sides of the
     box, where the gradient of the vorticity is not made up by the boundary, and averaged onto faces. There are four
     arrays to work in.
@@ -125,13 +125,19 @@ def _accelerated(
     lift: ti.f32,
     dt: ti.f32,
 ):
-    """Velocity of a face: with the mean force of the cells beside it, or that of the solid where it is closed."""
+    """Velocity of a face: with the mean force of the cells beside it, or at rest on sides of the box.
+
+    What is continued into solids stays.
+    """
     density, excess = ti.static((air.state.density, air.state.excess))
     at = row + k
     below = at - steps(air.box)[axis]
     force = confinement[at] + sink * density[at] + lift * excess[at]
     force += confinement[below] + sink * density[below] + lift * excess[below]
-    return ti.select(openness[at] == 0.0, face_velocity(air.box, air.solids, axis, at), face[at] + 0.5 * dt * force)
+    closed = 0.0
+    if ti.static(air.solids.cuts):
+        closed = ti.select(flux_part(air.solids, axis, at) > 0.0, 0.0, face[at])
+    return ti.select(openness[at] == 0.0, closed, face[at] + 0.5 * dt * force)
 
 
 def cool(air: Air, parameters: SmokeParameters, dt: float) -> None:

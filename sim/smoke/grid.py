@@ -1,9 +1,10 @@
-"""The staggered grid of a smoke: where its values live, which cells are solid and which faces are open.
+"""The staggered grid of a smoke: where its values live, how far its cells are from solids, which faces are open.
 
 Every array is stored flat with one layer of ghost cells around it, C order, so that a value of cell (i, j, k),
 counted from 1, stands at index (i * (ny + 2) + j) * (nz + 2) + k. A face has the index of the cell on its upper side:
 `u_face_x` at (i, j, k) lies between the cells (i - 1, j, k) and (i, j, k), for i = 1 .. nx + 1. Ghosts make every
-stencil the same everywhere; which face lets air pass is decided by its conductance alone.
+stencil the same everywhere; which face lets air pass is decided by its conductance alone. A corner of cells has the
+index of the cell of which it is the lowest.
 """
 
 from __future__ import annotations
@@ -15,30 +16,31 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from sim.core.domain import DomainParameters, Face
 from sim.shapes.solid import HasSignedDistance
+from sim.smoke.cut_cells import FAR, ROUNDING, is_split
 from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Index3 = tuple[int, int, int]
 
-CENTRE = (0.5, 0.5, 0.5)  # of a cell, in cells off its lower corner
+LOWEST, CENTRE = (0.0, 0.0, 0.0), (0.5, 0.5, 0.5)  # corner and centre of a cell, in cells off its lower corner
 
 
 @dataclass(frozen=True)
 class SmokeGrid:
-    """A box of cubic cells, its open sides and the solid cells in it.
+    """A box of cubic cells, its open sides and the solids in it that stand still.
 
-    Solids are voxelized: a cell is solid if its centre lies inside a solid, and a face of a solid cell is closed. The
-    surface is thus a staircase, wrong by up to half a cell; flow along it slips.
+    Solids cut cells and their faces (`cut_cells`); flow along them slips.
     """
 
     origin: tuple[float, float, float]  # lower corner [m]
     cell_size: float  # edge of a cell [m]
     cells: Index3  # how many cells along x, y, z
     open_faces: frozenset[Face]  # sides of the box that air passes freely; the others are walls
-    solid: NDArray[np.bool_]  # (nx, ny, nz) bool, which cells are in solids that stand still
+    distance: NDArray[np.float32]  # of corners from these solids, (nx + 1, ny + 1, nz + 1), not beyond `FAR` [cells]
     inflow_faces: frozenset[Face] = frozenset()  # where wind comes in at a given speed; walls to the pressure
 
     @classmethod
@@ -63,37 +65,70 @@ class SmokeGrid:
         empty = cls.of_box(parameters, domain)
         if not solids:
             return empty
-        masks = [empty.cells_inside(region) for region in solids]
-        for region, mask in zip(solids, masks, strict=True):
-            if not mask.any() and empty.misses(region):
+        for region in solids:
+            if empty.misses(region):
                 thinnest = float(np.ptp(region.bounds, axis=0).min())
                 raise ValueError(
                     f'smoke "{parameters.name}": an obstacle {thinnest:.3g} m thin falls between its cells of '
                     f"{parameters.cell_size:g} m, and would not be there; use a smaller cell_size or a thicker body"
                 )
-        solid = np.any(masks, axis=0)
-        if solid.all():
+        grid = empty.with_solids(solids)
+        if grid.solid.all():
             raise ValueError(f'smoke "{parameters.name}": solids fill its whole box; there is no air to move')
-        return replace(empty, solid=solid)
+        return grid
 
     @classmethod
     def of_box(cls, parameters: SmokeParameters, domain: DomainParameters) -> SmokeGrid:
         """The cells of a smoke's box, of which none is solid; the box must not be empty."""
         cells, inflow = parameters.cell_counts(domain), frozenset(parameters.windward_faces)
         is_open, lower = frozenset(parameters.open_faces) - inflow, parameters.min or domain.min
-        return cls(lower, parameters.cell_size, cells, is_open, np.zeros(cells, bool), inflow)
+        return cls.of_cells(lower, parameters.cell_size, cells, is_open, inflow)
+
+    @classmethod
+    def of_cells(
+        cls,
+        origin: tuple[float, float, float],
+        cell_size: float,
+        cells: Index3,
+        open_faces: frozenset[Face],
+        inflow_faces: frozenset[Face] = frozenset(),
+    ) -> SmokeGrid:
+        """A box of so many cells, without solids."""
+        corners = tuple(n + 1 for n in cells)
+        return cls(origin, cell_size, cells, open_faces, np.full(corners, FAR, np.float32), inflow_faces)
+
+    def with_solids(self, solids: Sequence[HasSignedDistance]) -> SmokeGrid:
+        """The same box with these solids in it as well."""
+        distance = self.distance.copy()
+        for region in solids:
+            # A cell that is cut has a corner inside of the bounds, and none more than an edge beyond.
+            spans, near = self._distances(region, distance.shape, LOWEST, margin=self.cell_size * (1.0 + WHOLE))
+            scaled = near / self.cell_size
+            scaled[np.abs(scaled) < ROUNDING] = 0.0
+            distance[spans] = np.minimum(distance[spans], scaled.astype(np.float32))
+        return replace(self, distance=distance)
 
     def misses(self, region: HasSignedDistance) -> bool:
-        """Whether a region that reaches into the box is thinner than a cell, and holds no centre of one.
-
-        On a closed side one counts from the first layer of centres on: below that the side is there in its place.
-        """
+        """Whether a region that reaches into the box is thinner than a cell, and holds no corner of one."""
         lower, upper = region.bounds
-        from_side = [[WHOLE if self.lets_in(axis, side) else 0.5 for axis in range(3)] for side in (0, 1)]
-        low, high = self.cell_size * np.asarray(from_side)
-        reaches_in = np.all((lower < np.asarray(self.upper) - high) & (upper > np.asarray(self.origin) + low))
-        is_thin = np.min(upper - lower) < self.cell_size
-        return bool(reaches_in and is_thin and not self._near(region, self.cells, CENTRE)[1].any())
+        rounding = WHOLE * self.cell_size
+        low, high = np.asarray(self.origin) + rounding, np.asarray(self.upper) - rounding
+        is_thin = np.all((lower < high) & (upper > low)) and np.min(upper - lower) < self.cell_size
+        return bool(is_thin and not (self._distances(region, self.distance.shape, LOWEST)[1] <= 0.0).any())
+
+    @cached_property
+    def has_solids(self) -> bool:
+        """Whether any corner lies in a solid."""
+        return bool((self.distance <= 0.0).any())
+
+    @cached_property
+    def solid(self) -> NDArray[np.bool_]:
+        """Cells that hold no air, (nx, ny, nz), but for small ones that no others keep (`cut_cells`)."""
+        outside = np.zeros(self.cells, np.int32)
+        for corner in range(8):
+            outside |= (cell_corners(self.distance, corner) > 0.0).astype(np.int32) << corner
+        solid: NDArray[np.bool_] = (outside == 0) | is_split(outside)
+        return solid
 
     @property
     def padded(self) -> Index3:
@@ -127,8 +162,8 @@ class SmokeGrid:
 
     def cut_off_faces(self) -> list[Face]:
         """Sides that wind blows in through where static solids shut some air behind them off from every open side."""
-        number, count = ndimage.label(~self.solid)
-        is_open = np.zeros(count + 1, bool)
+        number = self.air_regions()
+        is_open = np.zeros(number.max() + 1, bool)
         is_open[0] = True  # solids
         for axis, side in self.open_sides:
             is_open[np.moveaxis(number, axis, 0)[-side]] = True
@@ -137,6 +172,18 @@ class SmokeGrid:
             for face in sorted(self.inflow_faces)
             if not is_open[np.moveaxis(number, "xyz".index(face[0]), 0)[0 if face[1] == "-" else -1]].all()
         ]
+
+    def air_regions(self) -> NDArray[np.int64]:
+        """Number, from 1, of the region of air that is connected through open faces, (nx, ny, nz); 0 in solid cells."""
+        index = np.arange(self.solid.size).reshape(self.cells)
+        pairs = []
+        for axis in range(3):
+            cells, is_open = np.moveaxis(index, axis, 0), np.moveaxis(self.open_area[axis], axis, 0)[1:-1]
+            pairs.append(np.stack([cells[:-1][is_open], cells[1:][is_open]]))
+        below, above = np.concatenate(pairs, axis=1)
+        graph = coo_array((np.ones(len(below), bool), (below, above)), shape=(index.size, index.size))
+        number = connected_components(graph, directed=False)[1].reshape(self.cells) + 1
+        return np.where(self.solid, 0, number)
 
     def cell_centres(self) -> NDArray[np.float64]:
         """Positions [m], (nx * ny * nz, 3)."""
@@ -161,7 +208,7 @@ class SmokeGrid:
 
     @cached_property
     def open_area(self) -> tuple[NDArray[np.bool_], ...]:
-        """Which faces air passes, by axis, `face_shape(axis)`."""
+        """Which faces air passes in part at least, by axis, `face_shape(axis)`."""
         return tuple(self._open_area(axis) for axis in range(3))
 
     def pad(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -174,7 +221,7 @@ class SmokeGrid:
         """The inner part, of a given shape, of a flat or padded array."""
         return values.reshape(self.padded)[tuple(slice(1, 1 + n) for n in shape)]
 
-    def _axes(self, shape: Index3, offset: Sequence[float]) -> list[NDArray[np.float64]]:
+    def _axes(self, shape: Sequence[int], offset: Sequence[float]) -> list[NDArray[np.float64]]:
         """Positions [m] along x, y and z of places that are `offset` cells off the lower corners."""
         return [
             low + (np.arange(n) + shift) * self.cell_size
@@ -184,34 +231,41 @@ class SmokeGrid:
     def _inside(self, region: HasSignedDistance, shape: Index3, offset: Sequence[float]) -> NDArray[np.bool_]:
         """Which places lie inside a region."""
         inside = np.zeros(shape, bool)
-        spans, near = self._near(region, shape, offset)
-        inside[spans] = near
+        spans, near = self._distances(region, shape, offset)
+        inside[spans] = near < 0.0
         return inside
 
-    def _near(
-        self, region: HasSignedDistance, shape: Index3, offset: Sequence[float]
-    ) -> tuple[tuple[slice, ...], NDArray[np.bool_]]:
-        """The places within a region's bounds, and which of them lie inside: distances are dear for meshes."""
+    def _distances(
+        self, region: HasSignedDistance, shape: tuple[int, ...], offset: Sequence[float], *, margin: float = 0.0
+    ) -> tuple[tuple[slice, ...], NDArray[np.float64]]:
+        """The places within a margin [m] of a region's bounds, and their distances [m]: these are dear for meshes."""
         axes = self._axes(shape, offset)
         lower, upper = region.bounds
         spans = tuple(
-            slice(int(np.searchsorted(axis, low)), int(np.searchsorted(axis, high, "right")))
+            slice(int(np.searchsorted(axis, low - margin)), int(np.searchsorted(axis, high + margin, "right")))
             for axis, low, high in zip(axes, lower, upper, strict=True)
         )
         near = [axis[span] for axis, span in zip(axes, spans, strict=True)]
         counts = tuple(map(len, near))
         if 0 in counts:
-            return spans, np.zeros(counts, bool)
-        inside: NDArray[np.bool_] = region.signed_distance(_points(near)) < 0.0
-        return spans, inside.reshape(counts)
+            return spans, np.zeros(counts)
+        distance: NDArray[np.float64] = region.signed_distance(_points(near))
+        return spans, distance.reshape(counts)
 
     def _open_area(self, axis: int) -> NDArray[np.bool_]:
         air = np.moveaxis(~self.solid, axis, 0)
-        area = np.zeros((air.shape[0] + 1, *air.shape[1:]), bool)
-        area[1:-1] = air[1:] & air[:-1]
-        area[0] = air[0] & self.is_open(axis, 0)
-        area[-1] = air[-1] & self.is_open(axis, 1)
+        corners = np.moveaxis(self.distance, axis, 0) > 0.0
+        area = corners[:, 1:, 1:] | corners[:, 1:, :-1] | corners[:, :-1, 1:] | corners[:, :-1, :-1]
+        area[1:-1] &= air[1:] & air[:-1]
+        area[0] &= air[0] & self.is_open(axis, 0)
+        area[-1] &= air[-1] & self.is_open(axis, 1)
         return np.moveaxis(area, 0, axis)
+
+
+def cell_corners(values: NDArray[np.float32], corner: int) -> NDArray[np.float32]:
+    """Of each cell the value at one of its corners, 4 dx + 2 dy + dz."""
+    shifts = corner >> 2, corner >> 1 & 1, corner & 1
+    return values[tuple(slice(shift, n - 1 + shift) for shift, n in zip(shifts, values.shape, strict=True))]
 
 
 def _face_offset(axis: int) -> tuple[float, ...]:

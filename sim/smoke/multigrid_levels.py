@@ -22,7 +22,7 @@ from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_faces, new_floats
 from sim.smoke.grid import Index3, SmokeGrid
 from sim.smoke.lanes import Grid, cell_counts, device_grid, lane_items, lane_place, row_start, steps
-from sim.smoke.obstacles import Obstacles, Solids, is_solid
+from sim.smoke.obstacles import Obstacles, Solids, flux_part
 
 COARSEST_CELLS = 64  # at most this many cells are solved directly, by a dense inverse
 LARGEST_INDEX = 2**31 - 1  # flat indices in kernels are 32 bits wide
@@ -143,7 +143,8 @@ class Coefficients:
         """Follow the obstacles."""
         begins = [level.distance_offsets for level in self.levels]
         for axis, faces in enumerate(self.operator.faces):
-            _open_faces(axis, self.boxes[0], self._obstacles.solids, self._distance, begins[0][axis], faces)
+            sides = tuple(float(self._obstacles.grid.is_open(axis, side)) for side in (0, 1))
+            _open_faces(axis, self.boxes[0], self._obstacles.solids, *sides, self._distance, begins[0][axis], faces)
             for (fine, fine_begins), (coarse, coarse_begins) in pairwise(zip(self.boxes, begins, strict=True)):
                 _coarsen(axis, faces, self._distance, fine, fine_begins[axis], coarse, coarse_begins[axis])
         for box in self.boxes:
@@ -168,15 +169,24 @@ def invert_diagonal_at(operator: Operator, at: ti.i32, step_x: ti.i32, step_y: t
 
 @kernel
 def _open_faces(
-    axis: ti.template(), box: Grid, solids: Solids, distance: Floats, distance_begin: ti.i32, conductance: Floats
+    axis: ti.template(),
+    box: Grid,
+    solids: Solids,
+    low_side: ti.f32,
+    high_side: ti.f32,
+    distance: Floats,
+    distance_begin: ti.i32,
+    conductance: Floats,
 ):
+    """Conductance of the faces across an axis; sides of the box are 1 if they are open, else 0."""
     extra_x, extra_y, extra_z = ti.static(int(axis == 0), int(axis == 1), int(axis == 2))
     for i, j, lane in ti.ndrange((1, box.nx + 1 + extra_x), (1, box.ny + 1 + extra_y), box.lanes):
         for n in range(lane_items(box, box.nz + extra_z, lane)):
             k = lane_place(box, n, lane)
-            at = row_start(box, i, j) + k
-            is_closed = is_solid(solids, at - steps(box)[axis]) or is_solid(solids, at)
-            conductance[at] = ti.select(is_closed, 0.0, 1.0 / distance[distance_begin + ti.Vector([i, j, k])[axis]])
+            at, p = row_start(box, i, j) + k, ti.Vector([i, j, k])[axis]
+            area = flux_part(solids, axis, at)
+            area *= ti.select(p == 1, low_side, ti.select(p == cell_counts(box)[axis] + 1, high_side, 1.0))
+            conductance[at] = area / distance[distance_begin + p]
 
 
 @kernel

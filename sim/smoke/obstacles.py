@@ -1,23 +1,21 @@
-"""Obstacles in a smoke's box that may move: which cells they fill now, and how fast they are there.
+"""Obstacles in a smoke's box that may move: what they leave open now and did before, and how fast they are.
 
-Who has something in the box marks its cells before each step of the smoke, with the velocity that the solid has at
-their centres:
+Who has something in the box marks the corners of cells before each step of the smoke, with their signed distance from
+the solid in cells and the velocity that the solid has there, on both sides of its surface and a cell beyond:
 
     @kernel
     def _mark(box: Grid, marks: Marks, ...):
-        for i, j in ti.ndrange((1, box.nx + 1), (1, box.ny + 1)):
-            for k in range(1, box.nz + 1):
-                if <the centre of the cell lies inside>:
-                    mark(marks, row_start(box, i, j) + k, velocity)
+        for i, j in ti.ndrange((1, box.nx + 2), (1, box.ny + 2)):
+            for k in range(1, box.nz + 2):
+                mark(marks, row_start(box, i, j) + k, distance, velocity)
 
     _mark(smoke.obstacles.box, smoke.obstacles.marks, ...)
 
-The step itself then commits them: from there on they are the obstacles, and all marks are taken off. Where two mark the
-same cell the later one's velocity counts; static solids are never overridden.
+The lowest corner of a cell has its index. The step itself then commits them: from there on they are the obstacles, and
+all marks are taken off. Of several solids the nearest counts. What they leave open: `cut_cells`.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -28,28 +26,14 @@ from sim.core.arrays import Floats, Integers
 from sim.core.bundles import bundle, func
 from sim.core.host_access import copied
 from sim.core.launch import kernel
-from sim.smoke.arrays import Faces, State, new_faces
+from sim.smoke.arrays import Faces, State, new_faces, new_floats
+from sim.smoke.cut_cells import FAR, ROUNDING, find_keepers, mark_keepers, measure_areas, measure_volumes
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid, device_grid, lane_items, lane_place, row_start, steps
-from sim.smoke.reductions import Pair, Rows, new_rows, partial_place, sum_up
-
-AIR, MOVING, STATIC = range(3)  # what a cell is. Beyond closed sides of the box all is static, beyond open ones air.
-
-
-@dataclass(frozen=True)
-class Change:
-    """What a commit changed."""
-
-    cells: int  # how many cells became air or solid
-    covered: float  # density that was in cells that are solid now, summed over cells [-]
-    uncovered: float  # density in the cells that are air now, likewise
-
-
-NO_CHANGE = Change(0, 0.0, 0.0)
 
 
 class Mover(Protocol):
-    """Somebody who marks cells."""
+    """Somebody who marks corners."""
 
     def stable_dt(self) -> float:
         """Largest step [s] in which none of its solids gets farther than a cell in the box, as far as it can tell."""
@@ -68,18 +52,23 @@ def time_of_travel(distance: float, speed: float, acceleration: float) -> float:
 
 @bundle
 class Solids(NamedTuple):
-    """The solid cells."""
+    """What the solids leave open, and where they are; of no meaning without `cuts`."""
 
-    state: Integers  # AIR, MOVING or STATIC
-    velocity: Faces  # components at the centres of MOVING cells [m/s]; of no meaning elsewhere
-    moving: ti.template()  # whether there may be MOVING cells
+    area: Faces  # open parts of faces [-]; of moving solids the means of before and after the last commit
+    volume: Floats  # open parts of cells [-], 1 in ghosts
+    before: Floats  # the same before the last commit
+    words: Integers  # who keeps what small cells hold (`cut_cells`)
+    distance: Floats  # of corners from solids, not beyond `FAR` [cells]; negative inside
+    velocity: Faces  # of the nearest solid at corners [m/s]
+    cuts: ti.template()  # whether there are or may be solids
+    moving: ti.template()  # whether they may move
 
 
 @bundle
 class Marks(NamedTuple):
-    """The solid cells of the next commit."""
+    """The solids of the next commit."""
 
-    state: Integers
+    distance: Floats
     velocity: Faces
 
 
@@ -94,28 +83,37 @@ class Air(NamedTuple):
 
 
 class Obstacles:
-    """The solid cells of one grid: static ones, and those that others mark step by step.
+    """The solids in one grid: static ones, and those that others mark step by step.
 
     Attributes:
-        grid: the cells; its `solid` are the static ones.
+        grid: the cells; its `distance` is from the static ones.
         box: the same for kernels.
-        moving: whether anybody marks cells; without, nothing ever changes.
+        moving: whether anybody marks corners; without, nothing ever changes.
         movers: who does; steps are cut to follow them.
-        solids: the cells now; their velocities are there only if `moving`.
-        marks: likewise, of the next commit.
+        solids: now.
+        marks: of the next commit.
     """
 
     def __init__(self, grid: SmokeGrid, *, moving: bool = False) -> None:
         self.grid, self.box, self.moving = grid, device_grid(grid.cells), moving
-        self._static = _static_state(grid)
         self.movers: list[Mover] = []
-        velocity = new_faces(grid.size if moving else 1)
-        self.solids = Solids(ti.ndarray(ti.i32, grid.size), velocity, moving)
-        self.marks = Marks(ti.ndarray(ti.i32, grid.size if moving else 1), velocity)
-        self._rows = new_rows(self.box) if moving else None
-        self.solids.state.from_numpy(self._static)
-        if moving:
-            self.marks.state.from_numpy(self._static)
+        cuts = moving or grid.has_solids
+        size, of_movers = grid.size if cuts else 1, grid.size if moving else 1
+        volume, distance, velocity = new_floats(size), new_floats(size), new_faces(of_movers)
+        before = new_floats(size) if moving else volume
+        for array in (volume, before):
+            array.fill(1.0)
+        self.solids = Solids(
+            new_faces(size), volume, before, ti.ndarray(ti.i32, size), distance, velocity, cuts, moving
+        )
+        self.marks = Marks(new_floats(of_movers), velocity)
+        self._static, self._distance_before = new_floats(of_movers), new_floats(size) if moving else distance
+        if cuts:
+            distance.from_numpy(self._flat(grid.distance))
+            if moving:
+                for array in (self._static, self.marks.distance):
+                    array.copy_from(distance)
+            self._settle()
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no solid crosses more than a cell, so that none leaps over the smoke in its way.
@@ -124,103 +122,156 @@ class Obstacles:
         """
         return min((mover.stable_dt() for mover in self.movers), default=math.inf)
 
+    def open_volume(self) -> NDArray[np.float32]:
+        """Open parts of the cells now, (nx, ny, nz)."""
+        if not self.solids.cuts:
+            return np.ones(self.grid.cells, np.float32)
+        return self.grid.trim(copied(self.solids.volume), self.grid.cells)
+
     def is_air(self) -> NDArray[np.bool_]:
-        """Which cells are air now, (nx, ny, nz)."""
-        air: NDArray[np.bool_] = self.grid.trim(copied(self.solids.state), self.grid.cells) == AIR
+        """Which cells are open now, in part at least, (nx, ny, nz)."""
+        air: NDArray[np.bool_] = self.open_volume() > 0.0
         return air
 
-    def commit(self, density: ti.Ndarray) -> Change:
-        """Take the marked cells for the obstacles from now on; sums up the smoke of those covered and uncovered."""
+    def commit(self) -> bool:
+        """Take the marked solids for the obstacles from now on; returns whether anything that they leave open changed.
+
+        It also does where they stop, since `before` then is what is now.
+        """
         if not self.moving:
-            return NO_CHANGE
-        cells = int(_swap(self.box, self.solids.state, self.marks.state, density, self._rows))
-        return Change(cells, *map(float, _sum_changes(self._rows))) if cells else NO_CHANGE
+            return False
+        moved = bool(_swap(self.box, self.solids, self._distance_before, self._static, self.marks.distance))
+        changed = moved or self._moved
+        self._moved = moved
+        if changed:
+            self._measure()
+        return changed
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """Which cells are moving solids, if any may be; their velocities have gone into the faces."""
+        """Distances of the corners, if any solid may move; velocities have gone into the faces."""
         if not self.moving:
             return {}
-        return {"obstacles": (self.solids.state.to_numpy() == MOVING).reshape(self.grid.padded)}
+        return {"obstacles": self.solids.distance.to_numpy().reshape(self.grid.padded)}
 
-    def restore(self, is_moving: NDArray[np.generic]) -> None:
-        """Continue from the cells of a checkpoint, `padded`."""
-        state = np.where(np.asarray(is_moving, bool).ravel(), np.int32(MOVING), self._static)
-        self.solids.state.from_numpy(state)
-        self.marks.state.from_numpy(self._static)
+    def restore(self, distance: NDArray[np.generic]) -> None:
+        """Continue from the distances of a checkpoint, `padded`."""
+        self.solids.distance.from_numpy(np.ascontiguousarray(distance, np.float32).ravel())
+        self.marks.distance.copy_from(self._static)
+        self._settle()
+
+    def _settle(self) -> None:
+        """Take the solids for having been where they are."""
+        if self.moving:
+            self._distance_before.copy_from(self.solids.distance)
+        self._measure()
+        self._measure()
+        self._moved = True
+
+    def _measure(self) -> None:
+        solids, distances = self.solids, (self.solids.distance, self._distance_before)
+        measure_volumes(self.box, distances[0], solids.volume, solids.before)
+        volumes = solids.volume, solids.before
+        find_keepers(self.box, *distances, *volumes, solids.words, self.moving)
+        mark_keepers(self.box, *volumes, solids.words)
+        for axis, area in enumerate(solids.area):
+            measure_areas(axis, self.box, *distances, *volumes, area, self.moving)
+
+    def _flat(self, distance: NDArray[np.float32]) -> NDArray[np.float32]:
+        padded = np.full(self.grid.padded, FAR, np.float32)
+        padded[1:, 1:, 1:] = distance
+        return padded.ravel()
 
 
 @func
-def mark(marks: Marks, at: ti.i32, velocity):
-    """The cell at a flat index is solid in the coming step and moves there with a velocity [m/s]."""
-    if marks.state[at] != STATIC:
-        marks.state[at] = MOVING
+def mark(marks: Marks, at: ti.i32, distance: ti.f32, velocity):
+    """The corner at a flat index is so far from a solid in the coming step [cells], which moves there so fast [m/s]."""
+    rounded = ti.select(ti.abs(distance) < ROUNDING, 0.0, distance)
+    if rounded < marks.distance[at]:
+        marks.distance[at] = rounded
         marks.velocity.x[at] = velocity[0]
         marks.velocity.y[at] = velocity[1]
         marks.velocity.z[at] = velocity[2]
 
 
 @func
-def is_solid(solids: Solids, at: ti.i32):
-    """Whether the cell at a flat index is solid now."""
-    return solids.state[at] != AIR
+def wall_flux(box: Grid, solids: Solids, at: ti.i32) -> ti.f32:
+    """What solids push into a cell, over the area of a face [m/s]: the integral of u_solid.n over their surface in it.
+
+    By Gauss' theorem of what crosses the closed parts of its faces, less what the solid itself spreads inside.
+    """
+    through, spread = 0.0, 0.0
+    for axis in ti.static(range(3)):
+        along = steps(box)[axis]
+        low, high = _solid_velocity(axis, box, solids, at), _solid_velocity(axis, box, solids, at + along)
+        through += (1.0 - flux_part(solids, axis, at)) * low - (1.0 - flux_part(solids, axis, at + along)) * high
+        spread += low - high
+    return through - (1.0 - mean_volume(solids, at)) * spread
 
 
 @func
-def face_velocity(box: Grid, solids: Solids, axis: ti.template(), at: ti.i32):
-    """Velocity [m/s] of the solid across a closed face: of its solid cell, or the mean of both.
+def _solid_velocity(axis: ti.template(), box: Grid, solids: Solids, at: ti.i32) -> ti.f32:
+    """Velocity of solids across the face of which the lowest corner is at an index [m/s]."""
+    first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
+    speed = ti.static((solids.velocity.x, solids.velocity.y, solids.velocity.z)[axis])
+    a, b = steps(box)[first], steps(box)[second]
+    return 0.25 * ((speed[at] + speed[at + a]) + (speed[at + b] + speed[at + a + b]))
 
-    For a rigid motion that of the cell is exact: v + omega x r does not change along its own direction.
-    """
-    velocity = 0.0
+
+@func
+def is_solid(solids: Solids, at: ti.i32):
+    """Whether nothing of the cell at a flat index is open now."""
+    solid = False
+    if ti.static(solids.cuts):
+        solid = solids.volume[at] == 0.0
+    return solid
+
+
+@func
+def part_before(solids: Solids, at: ti.i32) -> ti.f32:
+    """Open part of the cell at a flat index before the last commit, which is that of what it holds until then [-]."""
+    part = 1.0
+    if ti.static(solids.cuts):
+        part = solids.before[at]
+    return part
+
+
+@func
+def mean_volume(solids: Solids, at: ti.i32) -> ti.f32:
+    """Open part of a cell, the mean of before and after the last commit."""
+    volume = 1.0
     if ti.static(solids.moving):
-        component = ti.static((solids.velocity.x, solids.velocity.y, solids.velocity.z)[axis])
-        below = at - steps(box)[axis]
-        count = int(solids.state[below] != AIR) + int(solids.state[at] != AIR)
-        total = ti.select(solids.state[below] == MOVING, component[below], 0.0)
-        total += ti.select(solids.state[at] == MOVING, component[at], 0.0)
-        velocity = total / ti.max(1.0, float(count))
-    return velocity
+        volume = 0.5 * (solids.before[at] + solids.volume[at])
+    elif ti.static(solids.cuts):
+        volume = solids.volume[at]
+    return volume
+
+
+@func
+def flux_part(solids: Solids, axis: ti.template(), at: ti.i32) -> ti.f32:
+    """Part of a face across an axis through which air flows with the velocity of the face."""
+    part = 1.0
+    if ti.static(solids.cuts):
+        part = ti.static((solids.area.x, solids.area.y, solids.area.z)[axis])[at]
+    return part
 
 
 @kernel
-def _swap(box: Grid, state: Integers, marked: Integers, density: Floats, rows: Rows) -> ti.i32:
+def _swap(box: Grid, solids: Solids, before: Floats, static: Floats, marked: Floats) -> ti.i32:
     changed = 0
-    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
-        covered, uncovered = 0.0, 0.0
+    for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
         in_row = 0
-        for n in range(lane_items(box, box.nz, lane)):
+        for n in range(lane_items(box, box.nz + 1, lane)):
             at = row_start(box, i, j) + lane_place(box, n, lane)
-            before, after = state[at], marked[at]
-            if before != after:
-                in_row += 1
-                state[at] = after
-                if after == AIR:
-                    uncovered += density[at]
-                else:
-                    covered += density[at]
-            if after == MOVING:
-                marked[at] = AIR
-        rows.partial[partial_place(box, i, j, lane)] = ti.Vector([covered, uncovered])
+            before[at] = solids.distance[at]
+            in_row += int(solids.distance[at] != marked[at])
+            solids.distance[at] = marked[at]
+            if marked[at] >= static[at]:
+                solids.velocity.x[at] = 0.0
+                solids.velocity.y[at] = 0.0
+                solids.velocity.z[at] = 0.0
+            marked[at] = static[at]
         changed += in_row
     return changed
-
-
-@kernel
-def _sum_changes(rows: Rows) -> Pair:
-    sum_up(rows)
-    return rows.nodes[0]
-
-
-def _static_state(grid: SmokeGrid) -> NDArray[np.int32]:
-    """Flat state of a grid with its static solids alone."""
-    state = np.full(grid.padded, STATIC, np.int32)
-    inner = (slice(1, -1),) * 3
-    for axis, side in grid.open_sides:
-        ghosts = list(inner)
-        ghosts[axis] = slice(-1, None) if side else slice(0, 1)
-        state[tuple(ghosts)] = AIR
-    state[inner] = np.where(grid.solid, STATIC, AIR)
-    return state.ravel()
 
 
 class AirForce(Protocol):

@@ -4,9 +4,11 @@ With density 1 and the impulse q = p dt / h as unknown, the projected velocity i
 conductance c, and A q = -h div u. The residual of that equation is then minus h times the divergence that is left, so
 the solver stops by what is asked for: max|div u| h / max|u|.
 
-Closed faces hold the velocity of the solid behind them, which drives the air: u.n = u_solid.n. A closed region has a
-solution only if no volume flows into it in sum. What obstacles press into it all the same, as a piston does, is spread
-evenly over its cells: the air there is compressed, or expands, at the same rate everywhere.
+Where solids cut cells the open part A of a face counts, and with it its conductance; its velocity is that in the open
+part (Batty, Bertails & Bridson 2007; Ng, Min & Gibou 2009). What moves with the velocity u_solid on the closed part
+drives the air: the flux through a face is A u + (1 - A) u_solid. A closed region has a solution only if no volume flows
+into it in sum. What obstacles press into it all the same, as a piston does, is spread evenly over its air: it is
+compressed, or expands, at the same rate everywhere.
 
 Flexible conjugate gradients (Notay 2000) because the preconditioner is not symmetric. When the recursion has reached
 its goal the velocity is corrected and its divergence measured anew; if rounding kept it above the goal, another solve
@@ -22,9 +24,10 @@ from sim.core.arrays import Floats
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_floats
+from sim.smoke.cut_cells import CHANGES, NEAR_SOLIDS
 from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start
 from sim.smoke.multigrid import Equation, MultigridVCycle, laplacian
-from sim.smoke.obstacles import Obstacles, Solids, is_solid
+from sim.smoke.obstacles import Obstacles, Solids, flux_part, mean_volume, wall_flux
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up
 from sim.smoke.regions import ClosedRegions
 
@@ -83,15 +86,14 @@ class PressureProjection:
         self.regions.find()
 
     def project(self) -> ProjectionReport:
-        """Remove the divergence of the velocity; closed faces must hold that of their solids, and keep it."""
+        """Remove the divergence of the velocity; what is closed to pressure keeps it."""
         self._clear_work()
         divergence, speed, compression = self._measure()
         iterations = 0
         while divergence > self._tolerance * speed and iterations < self._max_iterations:
             iterations += self._solve(SAFETY * self._tolerance * speed, self._max_iterations - iterations)
-            _subtract_gradient(
-                self._box, self._search.correction, self.multigrid.coefficients.operator.faces, self._velocity
-            )
+            openness, solids = self.multigrid.coefficients.operator.faces, self._obstacles.solids
+            _subtract_gradient(self._box, self._search.correction, openness, solids, self._velocity)
             divergence, speed, _ = self._measure()
         return ProjectionReport(
             iterations=iterations,
@@ -123,7 +125,8 @@ class PressureProjection:
         Returns:
             Its largest magnitude, the largest face velocity, and the largest magnitude of a mean.
         """
-        largest, speed = _compute_residual(self._box, self._obstacles.solids, self._velocity, self._search)
+        given = self._box, self._obstacles.solids, self._velocity, self._search
+        largest, speed = _compute_residual(*given)
         mean = self.regions.subtract_means(self._search.equation.right_hand_side, largest)
         if mean > 0.0:
             largest = float(_find_largest_residual(self._box, self._search))
@@ -146,8 +149,17 @@ def _compute_residual(box: Grid, solids: Solids, velocity: Faces, search: Search
             u, v, w = velocity.x[at], velocity.y[at], velocity.z[at]
             u_next, v_next, w_next = velocity.x[at + box.step_x], velocity.y[at + box.step_y], velocity.z[at + 1]
             residual = (u - u_next) + (v - v_next) + (w - w_next)
-            if is_solid(solids, at):
-                residual = 0.0
+            if ti.static(solids.cuts):
+                residual = flux_part(solids, 0, at) * u - flux_part(solids, 0, at + box.step_x) * u_next
+                residual += flux_part(solids, 1, at) * v - flux_part(solids, 1, at + box.step_y) * v_next
+                residual += flux_part(solids, 2, at) * w - flux_part(solids, 2, at + 1) * w_next
+            if ti.static(solids.moving):
+                if (solids.words[at] & (NEAR_SOLIDS | CHANGES)) != 0:
+                    residual += wall_flux(box, solids, at)
+                    for component in ti.static((solids.velocity.x, solids.velocity.y, solids.velocity.z)):
+                        speed = ti.max(speed, ti.abs(component[at]))
+                if mean_volume(solids, at) == 0.0:
+                    residual = 0.0
             search.equation.right_hand_side[at] = residual
             largest = ti.max(largest, ti.abs(residual))
             lower = ti.max(ti.abs(u), ti.abs(v), ti.abs(w))
@@ -252,18 +264,35 @@ def _plus(k: ti.i32, row: ti.i32, first: Floats, factor: ti.f32, second: Floats)
 
 
 @kernel
-def _subtract_gradient(box: Grid, correction: Floats, openness: Faces, velocity: Faces):
+def _subtract_gradient(box: Grid, correction: Floats, openness: Faces, solids: Solids, velocity: Faces):
     # The last planes of faces belong to ghost cells, whose pressure is 0 and whose other faces are closed.
     for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
         row = row_start(box, i, j)
-        for face, is_open, step in ti.static(
-            ((velocity.x, openness.x, box.step_x), (velocity.y, openness.y, box.step_y), (velocity.z, openness.z, 1))
+        for axis, face, is_open, step in ti.static(
+            (
+                (0, velocity.x, openness.x, box.step_x),
+                (1, velocity.y, openness.y, box.step_y),
+                (2, velocity.z, openness.z, 1),
+            )
         ):
-            given = ti.static((row, face, is_open, step, correction))
+            given = ti.static((row, axis, face, is_open, solids, step, correction))
             fill_row(box, face, row, box.nz + 1, lane, _less_gradient, given)
 
 
 @func
-def _less_gradient(k: ti.i32, row: ti.i32, face: Floats, openness: Floats, step: ti.i32, correction: Floats):
+def _less_gradient(
+    k: ti.i32,
+    row: ti.i32,
+    axis: ti.template(),
+    face: Floats,
+    openness: Floats,
+    solids: Solids,
+    step: ti.i32,
+    correction: Floats,
+):
     at = row + k
-    return face[at] - openness[at] * (correction[at] - correction[at - step])
+    per_distance = openness[at]
+    if ti.static(solids.cuts):
+        # Closed faces have a conductance of 0 to be divided by anything.
+        per_distance /= ti.max(flux_part(solids, axis, at), 1.0e-30)
+    return face[at] - per_distance * (correction[at] - correction[at - step])

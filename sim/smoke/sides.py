@@ -31,7 +31,7 @@ from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.smoke.lanes import Grid, cell_counts, steps
 from sim.smoke.multigrid_levels import Operator, invert_diagonal_at
-from sim.smoke.obstacles import Air, is_solid
+from sim.smoke.obstacles import Air, flux_part, is_solid
 
 
 def brake_inflow(
@@ -78,7 +78,7 @@ def _brake(sides: ti.template(), places: ti.i32, air: Air, operator: Operator, s
                 inward = normal[face] if ti.static(side == 0) else -normal[face]
                 drag = 1.0 + step * ti.max(inward, 0.0)
                 normal[face] /= drag
-                conductance[face] = 2.0 / drag
+                conductance[face] = 2.0 * flux_part(solids, axis, face) / drag
     # Cells behind two sides are found twice, with the same result.
     for n in range(places):
         for axis, side in ti.static(sides):

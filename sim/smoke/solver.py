@@ -29,6 +29,7 @@ from sim.smoke.projection import PressureProjection, ProjectionReport
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 from sim.smoke.sides import blow_in, brake_inflow, start_wind
 from sim.smoke.sources import build_sources
+from sim.smoke.transport import Transport
 from sim.smoke.turbulence import Turbulence
 
 RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed of sound [m/s]
@@ -37,22 +38,22 @@ RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed o
 class SmokeSolver:
     """Density, temperature and velocity of smoke in a box of cells, with solids in it that stand still or move.
 
-    One substep, by operator splitting as in Stam 1999: advect, let obstacles move on, accelerate, emit, project, cool.
-    Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
+    One substep, by operator splitting as in Stam 1999: advect velocity, let obstacles move on, accelerate, emit,
+    project, carry smoke and heat with what came of it, cool. Incompressible air of constant density (Boussinesq): smoke
+    and heat act through buoyancy alone.
 
     Exact, but for rounding: smoke is added by sources and leaves through open sides only, what sources add is counted,
-    and heat is kept likewise (`Transport`). At moving solids that holds to first order, so `mass` is a measured
-    quantity. Heat lets air rise by the strength of gravity, unless the parameters say how fast, and does not expand it.
+    and heat is kept likewise (`Transport`). Heat lets air rise by the strength of gravity, unless the parameters say
+    how fast, and does not expand it.
 
     Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`sim.smoke.sides`).
 
-    Solids that move drive air by the velocity of their surface (`Obstacles`), and take whole cells from time to time:
-    in between, air flows through the sides of their cells at the speed of the solid. So the smoke of a cell that they
-    cover is dropped, as much has come through the moving side ahead of it, and a cell that they
-    leave has the smoke that was continued into it, as much as flowed in behind them. Both are counted.
+    Solids cut cells (`cut_cells`), and those that move push air with the velocity of their surface (`Obstacles`): what
+    is in a cell that they cover goes where it is pushed. Beside them smoke is kept to second order of the step, so
+    `mass` is a measured quantity.
 
     In a closed region sources drive air, but do not add any; nor do bodies that are wholly inside. What a piston
-    presses into it is spread evenly (`PressureProjection`): its air is compressed, its smoke is not.
+    presses into it is spread evenly (`PressureProjection`): its air is compressed, and its smoke with it.
 
     State, float32: face velocities [m/s], density [-], temperature above the air's [K].
 
@@ -99,17 +100,18 @@ class SmokeSolver:
             maccormack=parameters.advection == "maccormack",
             wind=parameters.wind,
         )
+        self._transport = Transport(self.air, work, sharpens=parameters.advection == "maccormack")
         self._open_sides = self.grid.open_sides
         self._gravity, self._has_gravity = gravity, any(upward(gravity))
         self._lift = parameters.lift_per_kelvin(gravity)
-        self._extrapolation = Extrapolation(self.obstacles, self.state, reach=parameters.cfl)
+        self._extrapolation = Extrapolation(self.obstacles, self.state.velocity, work[:3], reach=parameters.cfl)
         self._rows = new_rows(self.air.box)
         self.sources = build_sources(parameters, self.grid, self.air)
         self._turbulence: Turbulence | None = None
         if parameters.turbulence.strength > 0.0:
             self._turbulence = Turbulence(self.grid, parameters.turbulence, parameters.wind)
         self.air_forces: list[AirForce] = []
-        self._emitted_mass = self._covered_mass = self._uncovered_mass = 0.0
+        self._emitted_mass = 0.0
         self.begin_frame(0.0)
         if any(parameters.wind):
             if cut_off := self.grid.cut_off_faces():
@@ -149,7 +151,7 @@ class SmokeSolver:
         return min(time_of_travel(distance, speed, acceleration + gusts), *limits)
 
     def substep(self, dt: float) -> None:
-        """Advance by dt [s]; the cells that obstacles fill at its end have been marked."""
+        """Advance by dt [s]; where obstacles are at its end has been marked."""
         self._advection.advance(dt)
         self.move_obstacles()
         self._accelerate(dt)
@@ -158,17 +160,14 @@ class SmokeSolver:
         operator, step = self._projection.multigrid.coefficients.operator, dt / self.grid.cell_size
         brake_inflow(self.air, operator, self._open_sides, self.grid.cells, step)
         self._projections.append(self._projection.project())
+        self._transport.advance(step)
         cool(self.air, self.parameters, dt)
         self._extrapolation.fill()
         self.time_s += dt
 
     def move_obstacles(self) -> None:
-        """Take the marked cells for the obstacles from now on; each step does so."""
-        change = self.obstacles.commit(self.state.density)
-        cell_volume = self.grid.cell_size**3
-        self._covered_mass += change.covered * cell_volume
-        self._uncovered_mass += change.uncovered * cell_volume
-        if change.cells:
+        """Take the marked solids for the obstacles from now on; each step does so."""
+        if self.obstacles.commit():
             self._follow_obstacles()
 
     def begin_frame(self, time_s: float) -> None:
@@ -199,7 +198,7 @@ class SmokeSolver:
     def view(self, body: str) -> dict[str, NDArray[np.generic]]:  # noqa: ARG002  a solver has one smoke
         """Density [-] and temperature above the air's [K] of the cells, in the solver's memory on a CPU.
 
-        Cells in solids hold what is continued into them.
+        Cells in solids hold none.
         """
         arrays = self._arrays
         return {
@@ -209,7 +208,7 @@ class SmokeSolver:
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The state with its ghosts, the obstacles that move, the time and the counted masses."""
         arrays = {name: values.to_numpy().reshape(self.grid.padded) for name, values in self._arrays.items()}
-        clock = np.array([self.time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass])
+        clock = np.array([self.time_s, self._emitted_mass])
         return {**arrays, **self.obstacles.checkpoint(), "clock": clock}
 
     def restore(self, arrays: Arrays) -> None:
@@ -219,7 +218,7 @@ class SmokeSolver:
             ValueError: an array is missing or has another shape.
         """
         moving = ["obstacles"] if self.obstacles.moving else []
-        expected = {**dict.fromkeys([*self._arrays, *moving], self.grid.padded), "clock": (4,)}
+        expected = {**dict.fromkeys([*self._arrays, *moving], self.grid.padded), "clock": (2,)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
@@ -229,22 +228,20 @@ class SmokeSolver:
         if moving:
             self.obstacles.restore(arrays["obstacles"])
             self._follow_obstacles()
-        clock = arrays["clock"].tolist()
-        self.time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass = clock
+        self.time_s, self._emitted_mass = arrays["clock"].tolist()
 
     def diagnostics(self) -> Diagnostics:
         """Totals of the state, and the projections of the frame.
 
-        `mass` and `emitted_mass` are volume integrals of density [m³]; `iterations` is the sum over the frame,
-        `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame. Where obstacles may move
-        there are also `covered_mass` and `uncovered_mass` [m³], of the cells that they entered and left since the
-        start, and `compression` [1/s], the worst of the frame (`ProjectionReport`).
+        `mass` and `emitted_mass` are integrals of density over the open parts of cells [m³]; `iterations` is the sum
+        over the frame, `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame. Where
+        obstacles may move there is also `compression` [1/s], the worst of the frame (`ProjectionReport`).
         """
         speed, _ = self._find_speed_and_acceleration()
-        air = self.obstacles.is_air()
-        excess = self._cells("excess_temperature")[air]
+        volume = self.obstacles.open_volume().astype(np.float64)
+        excess = self._cells("excess_temperature")[volume > 0.0]
         numbers = {
-            "mass": float(self._cells("density")[air].sum(dtype=np.float64)) * self.grid.cell_size**3,
+            "mass": float((self._cells("density") * volume).sum()) * self.grid.cell_size**3,
             "emitted_mass": self._emitted_mass,
             "max_temperature": self.parameters.ambient_temperature + (float(excess.max()) if len(excess) else 0.0),
             "max_speed": speed,
@@ -254,8 +251,6 @@ class SmokeSolver:
             "not_converged": float(sum(not report.converged for report in self._projections)),
         }
         if self.obstacles.moving:
-            numbers["covered_mass"] = self._covered_mass
-            numbers["uncovered_mass"] = self._uncovered_mass
             numbers["compression"] = max((report.compression for report in self._projections), default=0.0)
         return numbers
 

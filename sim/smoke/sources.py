@@ -17,7 +17,7 @@ from sim.core.motion import rotation
 from sim.shapes.placement import build_solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid
-from sim.smoke.obstacles import Air, is_solid
+from sim.smoke.obstacles import Air, is_solid, part_before
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 from sim.smoke.source_motion import CELLS, SourceMotion, SweptShape, motion_of
 
@@ -115,7 +115,7 @@ class Source:
         Fluctuation and flicker are functions of place and time alone, so a run that continues sees the same.
 
         Returns:
-            The density added, summed over cells [-].
+            The density added, summed over the air of cells [-].
         """
         begin_s, end_s = self.parameters.span_of(time_s, time_s + dt)
         if self.motion is not None:
@@ -183,7 +183,7 @@ def _raise_cells(
                 before = density[at]
                 after = ti.max(before, targets[0])
                 density[at] = after
-                emitted += after - before
+                emitted += part_before(air.solids, at) * (after - before)
                 target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * targets[1]
                 excess[at] = ti.max(excess[at], target) if ti.static(is_hot) else ti.min(excess[at], target)
         added[block] = emitted

@@ -1,10 +1,10 @@
-"""Whether the cells of a smoke are fine enough for the walls of a body: air passes through where none is solid.
+"""Whether the cells of a smoke are fine enough for the walls of a body: air passes between the corners that it holds.
 
-A cell is solid if its centre lies in the body. A wall of normal n and thickness d has in every column of cells along
-the axis of its largest |n_i| a solid one, and thus lets no air through, if d is at least cell_size * max |n_i|; of a
-thinner one a part of these columns has none, unless it happens to lie along a layer of centres. That part is what is
-measured here, at points of the surface. Beside an edge that is sharper than 45 degrees off a plate's two sides, such as
-the rim of a cone, a body is thin as well; cells only blunt it, and what they miss there does not count.
+A wall of normal n and thickness d holds a corner of every row of them along the axis of its largest |n_i|, and thus
+lets no air through (`cut_cells`), if d is at least cell_size * max |n_i|; of a thinner one a part of these rows has
+none, unless it happens to lie along a layer of corners. That part is what is measured here, at points of the surface.
+Beside an edge that is sharper than 45 degrees off a plate's two sides, such as the rim of a cone, a body is thin as
+well; cells only blunt it, and what they miss there does not count.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ def thin_walls(
 ) -> ThinWalls:
     """What a smoke's cells miss of a body that stands still in its box.
 
-    What lies on a closed side counts as seen, and so does what has a cell of another body, which stands still as well,
-    right beside it.
+    What lies on a closed side counts as seen, and so does what has a corner in another body, which stands still as
+    well, right beside it.
     """
     low, high = (np.asarray(corner) for corner in smoke.corners(domain))
     # A face that lies in a side of the box, but for round-off, is not in it.
     points, inwards = _probes(solid, (low + WHOLE * smoke.cell_size, high - WHOLE * smoke.cell_size))
     depth = _thickness(solid, points, inwards, smoke.cell_size)
     thin = np.flatnonzero(np.isfinite(depth))
-    missed = thin[~_has_solid_cell([solid, *others], points[thin], inwards[thin], smoke, domain)]
+    missed = thin[~_has_corner([solid, *others], points[thin], inwards[thin], smoke, domain)]
     return _walls(depth, missed, len(points))
 
 
@@ -61,7 +61,7 @@ def thin_walls_on_the_way(solid: Solid, smoke: SmokeParameters) -> ThinWalls:
     depth = _thickness(solid, points, inwards, smoke.cell_size)
     thin = np.flatnonzero(np.isfinite(depth))
     missed = [
-        thin[~_column([solid], points[thin], inwards[thin], np.full(3, part * smoke.cell_size), smoke.cell_size)]
+        thin[~_row([solid], points[thin], inwards[thin], np.full(3, part * smoke.cell_size), smoke.cell_size)]
         for part in LUCK
     ]
     return _walls(depth, np.concatenate(missed), len(LUCK) * len(points))
@@ -108,12 +108,12 @@ def _thickness(solid: Solid, points: Points, inwards: Points, longest: float) ->
     return left
 
 
-def _has_solid_cell(
+def _has_corner(
     solids: Sequence[Solid], points: Points, inwards: Points, smoke: SmokeParameters, domain: DomainParameters
 ) -> NDArray[np.bool_]:
-    """Whether the column of cells at each point has a solid one, or ends right there at a closed side, (n,)."""
+    """Whether the row of corners at each point has one in a body, or ends right there at a closed side, (n,)."""
     low, high = (np.asarray(corner) for corner in smoke.corners(domain))
-    found = _column(solids, points, inwards, low, smoke.cell_size)
+    found = _row(solids, points, inwards, low, smoke.cell_size)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
     for side, beside in (("-", points - low < smoke.cell_size), ("+", high - points < smoke.cell_size)):
         closed = np.array([f"{name}{side}" not in smoke.open_faces for name in "xyz"])
@@ -121,20 +121,18 @@ def _has_solid_cell(
     return found
 
 
-def _column(
-    solids: Sequence[Solid], points: Points, inwards: Points, low: Points, cell_size: float
-) -> NDArray[np.bool_]:
-    """Whether a body holds one of the two centres next to each point, along the axis of its largest |n_i|, (n,).
+def _row(solids: Sequence[Solid], points: Points, inwards: Points, low: Points, cell_size: float) -> NDArray[np.bool_]:
+    """Whether a body holds one of the two corners next to each point, along the axis of its largest |n_i|, (n,).
 
-    The column stands on the point, not on the centre of its cell: the rim of a plate, of which cells cut off up to half
-    their width, is not missed. Bodies may lie beside each other; cells have a corner at `low` [m], (3,).
+    The row goes through the point, not through corners: the rim of a plate, of which cells cut off up to their width,
+    is not missed. Bodies may lie beside each other; cells have a corner at `low` [m], (3,).
     """
     found = np.zeros(len(points), bool)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
-    layer = (points - low)[every, axis] / cell_size - 0.5
+    layer = (points - low)[every, axis] / cell_size
     for next_layer in (np.floor(layer), np.floor(layer) + 1.0):
         places = points.copy()
-        places[every, axis] = low[axis] + (next_layer + 0.5) * cell_size
+        places[every, axis] = low[axis] + next_layer * cell_size
         for solid in solids:
             left = np.flatnonzero(~found)
             found[left] = solid.signed_distance(places[left]) < 0.0

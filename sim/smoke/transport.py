@@ -11,6 +11,12 @@ probability c. The moments that this walk has beyond its mean, the way of the fl
 of the result L of the walk (Boris & Book 1976 call that form phoenical), and as far as no cell leaves the range of what
 it held and was given (Zalesak 1979, J. Comput. Phys. 31:335-362, section 4). Such limits act on the front and the rear
 of a cloud alike and do not shift it; limited corrections of cells, as MacCormack's scheme has them, cut its rear alone.
+
+Cells that solids cut have a part V of their volume, and parts A of their faces: A u flows through, and a cell holds V
+times its density. Small cells share what they hold with their keeper (`sim.smoke.cut_cells`) after each walk. Where
+solids move the air that has flowed out of a cell, sum A u dt/h, is not the change of V to the last bit: it is counted,
+V - sum A u dt/h, and smoke has the density that it has in that air; so even smoke stays even, and what is in a cell
+that is covered goes to its keeper. Beside solids the moments across axes and the third ones are left.
 """
 
 import math
@@ -20,11 +26,13 @@ import taichi as ti
 from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.smoke.arrays import Faces
+from sim.smoke.arrays import Faces, new_floats
+from sim.smoke.cut_cells import CHANGES, KEEPER, LEAST_VOLUME, NEAR_SOLIDS, keeper_of, way
 from sim.smoke.lanes import cell_counts, fill_row, fill_rows, lane_items, lane_place, row_start, steps
-from sim.smoke.obstacles import Air, is_solid
+from sim.smoke.obstacles import Air, Solids, flux_part
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 
+LEAST_ROOM = 1.0e-3  # of cells beside moving solids that tells a density [cells]
 KEEPS_OFF = 1.0e-6
 """Part of the way to a bound that limited fluxes leave: more than rounding of their sum."""
 
@@ -32,8 +40,7 @@ KEEPS_OFF = 1.0e-6
 class Transport:
     """Carries the density and the excess temperature of one grid.
 
-    What comes in through open sides is clean air at the air's temperature. Into and out of solids that move flows what
-    was continued into them; the cells in them keep that.
+    What comes in through open sides is clean air at the air's temperature. Cells in solids hold nothing.
 
     Args:
         air: whose state is carried.
@@ -44,48 +51,163 @@ class Transport:
     def __init__(self, air: Air, work: tuple[ti.Ndarray, ...], *, sharpens: bool) -> None:
         self._air, self._rows, self._sharpens = air, new_rows(air.box), sharpens
         self._spread, self._fluxes, self._kept = work[0], Faces(*work[1:4]), work[4:6]
+        solids = air.solids
+        self._room = new_floats(solids.volume.shape[0]) if solids.moving else solids.volume
 
     def advance(self, step: float) -> None:
         """Carry both by a step over the edge of a cell [s/m], in parts in which no cell gives more than it has."""
         given, _ = _largest_outflow(self._air, step, self._rows)
         parts = max(1, math.ceil(given))
         for values in (self._air.state.density, self._air.state.excess):
-            for _ in range(parts):
-                self._carry(values, step / parts)
+            if self._air.solids.moving:
+                _start(self._air, values, self._room)
+            for part in range(parts):
+                self._carry(values, step / parts, is_last=part == parts - 1)
 
-    def _carry(self, values: ti.Ndarray, step: float) -> None:
+    def _carry(self, values: ti.Ndarray, step: float, *, is_last: bool) -> None:
         air, spread, fluxes, (leaving, coming) = self._air, self._spread, self._fluxes, self._kept
-        _spread(air, values, spread, step)
+        volume = self._room
+        if air.solids.cuts:
+            _spread(air, values, volume, fluxes.x, step)
+            if air.solids.moving:
+                _drain(air, self._room, step)
+                volume = air.solids.volume if is_last else volume
+            _keep(air, fluxes.x, values, self._room, volume, spread)
+        else:
+            _spread(air, values, volume, spread, step)
         if self._sharpens:
             _find_fluxes(air, spread, fluxes, step)
-            _limit(air, values, spread, fluxes, leaving, coming, step)
-            _sharpen(air, values, spread, fluxes, leaving, coming)
+            _limit(air, values, spread, fluxes, volume, leaving, coming, step)
+            _sharpen(air, values, spread, fluxes, volume, leaving, coming)
         else:
-            _store(air, values, spread)
+            values.copy_from(spread)
 
 
 @kernel
 def _largest_outflow(air: Air, step: ti.f32, rows: Rows) -> Pair:
-    """The largest share of itself that a cell of air gives in a step over the edge of a cell [-]."""
-    box, velocity = ti.static((air.box, air.state.velocity))
+    """The largest share of itself that a cell, with those that it keeps, gives in a step over the edge of one [-]."""
+    box, solids = ti.static((air.box, air.solids))
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
         largest = 0.0
         for n in range(lane_items(box, box.nz, lane)):
-            at, given = row_start(box, i, j) + lane_place(box, n, lane), 0.0
-            for axis in ti.static(range(3)):
-                face = ti.static((velocity.x, velocity.y, velocity.z)[axis])
-                given += ti.max(face[at + steps(box)[axis]], 0.0) + ti.max(-face[at], 0.0)
-            largest = ti.max(largest, ti.select(is_solid(air.solids, at), 0.0, step * given))
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            given = step * _outflow(air, at)
+            if ti.static(air.solids.cuts):
+                code, held = solids.words[at] & 7, _held(solids, at)
+                if code == KEEPER:
+                    for direction in ti.static(range(6)):
+                        there = at + way(box, direction)
+                        if (solids.words[there] & 7) == ti.static((direction ^ 1) + 1):
+                            given += step * _outflow(air, there)
+                            held += _held(solids, there)
+                is_counted = keeper_of(code, at, box) == at and held > 0.0
+                given = ti.select(is_counted, given / ti.max(held, ti.static(LEAST_VOLUME)), 0.0)
+            largest = ti.max(largest, given)
         rows.partial[partial_place(box, i, j, lane)] = ti.Vector([largest, 0.0])
     find_maxima(rows)
     return rows.nodes[0]
 
 
+@func
+def _outflow(air: Air, at: ti.i32) -> ti.f32:
+    """Velocity of what leaves a cell, summed over its faces [m/s]."""
+    given = 0.0
+    for axis in ti.static(range(3)):
+        given += ti.max(_face_flux(air, axis, at + steps(air.box)[axis]), 0.0) + ti.max(-_face_flux(air, axis, at), 0.0)
+    return given
+
+
+@func
+def _held(solids: Solids, at: ti.i32) -> ti.f32:
+    """The least open part of a cell in a step, of a cell that is covered that of before."""
+    held = solids.volume[at]
+    if ti.static(solids.moving):
+        held = ti.select(held > 0.0, ti.min(held, solids.before[at]), solids.before[at])
+    return held
+
+
+@func
+def _size(solids: Solids, volume: Floats, at: ti.i32) -> ti.f32:
+    """Open part of a cell, where there are solids [-]."""
+    size = 1.0
+    if ti.static(solids.cuts):
+        size = volume[at]
+    return size
+
+
 @kernel
-def _spread(air: Air, values: Floats, spread: Floats, step: ti.f32):
+def _start(air: Air, values: Floats, room: Floats):
+    """Begin with the open parts of before the step; cells that were closed give at first what is around them."""
+    box, solids = ti.static((air.box, air.solids))
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            room[at] = solids.before[at]
+            if solids.before[at] == 0.0 and solids.volume[at] > 0.0:
+                total, count = 0.0, 0.0
+                for axis, openness in ti.static(enumerate((air.openness.x, air.openness.y, air.openness.z))):
+                    pair, along = 0.0, steps(box)[axis]
+                    for side in ti.static(range(2)):
+                        there = at + ti.static(2 * side - 1) * along
+                        # Ghosts hold nothing, and air from outside is clean.
+                        if solids.before[there] > 0.0 and openness[at + side * along] > 0.0:
+                            pair += values[there]
+                            count += 1.0
+                    total += pair
+                values[at] = total / ti.max(count, 1.0)
+
+
+@kernel
+def _spread(air: Air, values: Floats, room: Floats, spread: Floats, step: ti.f32):
+    """What each cell holds after the walk."""
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
-        given = ti.static((i, j, air, values, step))
+        given = ti.static((i, j, air, values, room, step))
         fill_row(air.box, spread, row_start(air.box, i, j), air.box.nz, lane, _spread_cell, given)
+
+
+@kernel
+def _drain(air: Air, room: Floats, step: ti.f32):
+    """Take what has flowed out of the room of cells beside solids that have moved."""
+    box, solids = ti.static((air.box, air.solids))
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            if (solids.words[at] & CHANGES) != 0:
+                lost = 0.0
+                for axis in ti.static(range(3)):
+                    lost += _face_flux(air, axis, at + steps(box)[axis]) - _face_flux(air, axis, at)
+                room[at] -= step * lost
+
+
+@ti.func
+def _in_range(density: ti.f32, low: ti.f32, high: ti.f32, size: ti.f32, before: ti.f32, word: ti.i32) -> ti.f32:
+    """Density beside solids that have moved: none that was not around, and that of before where no air tells it."""
+    bounded = ti.max(low, ti.min(high, density)) if size > LEAST_ROOM else before
+    return bounded if (word & CHANGES) != 0 else density
+
+
+@kernel
+def _keep(air: Air, held: Floats, values: Floats, room: Floats, volume: Floats, spread: Floats):
+    """Density of what cells hold, the same in small ones and their keepers."""
+    box, solids = ti.static((air.box, air.solids))
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            word = solids.words[at]
+            keeper = keeper_of(word, at, box)
+            amount, size = held[keeper], room[keeper]
+            low, high = values[keeper], values[keeper]
+            if (word & (KEEPER | CHANGES)) != 0:
+                for direction in ti.static(range(6)):
+                    there = keeper + way(box, direction)
+                    low, high = ti.min(low, values[there]), ti.max(high, values[there])
+                    if (solids.words[there] & 7) == ti.static((direction ^ 1) + 1):
+                        amount += held[there]
+                        size += room[there]
+            density = amount / ti.max(size, LEAST_ROOM)
+            if ti.static(solids.moving):
+                density = _in_range(density, low, high, size, values[keeper], solids.words[keeper])
+            spread[at] = density if volume[at] > 0.0 else 0.0
 
 
 @kernel
@@ -96,30 +218,30 @@ def _find_fluxes(air: Air, spread: Floats, fluxes: Faces, step: ti.f32):
 
 
 @kernel
-def _limit(air: Air, values: Floats, spread: Floats, fluxes: Faces, leaving: Floats, coming: Floats, step: ti.f32):
+def _limit(
+    air: Air,
+    values: Floats,
+    spread: Floats,
+    fluxes: Faces,
+    volume: Floats,
+    leaving: Floats,
+    coming: Floats,
+    step: ti.f32,
+):
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
-        outs, given = ti.static((leaving, coming), (i, j, air, values, spread, fluxes, step))
+        outs, given = ti.static((leaving, coming), (i, j, air, values, spread, fluxes, volume, step))
         fill_rows(air.box, outs, row_start(air.box, i, j), air.box.nz, lane, _kept_shares, given)
 
 
 @kernel
-def _sharpen(air: Air, values: Floats, spread: Floats, fluxes: Faces, leaving: Floats, coming: Floats):
+def _sharpen(air: Air, values: Floats, spread: Floats, fluxes: Faces, volume: Floats, leaving: Floats, coming: Floats):
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
-        given = ti.static((i, j, air, values, spread, fluxes, leaving, coming))
+        given = ti.static((i, j, air, spread, fluxes, volume, leaving, coming))
         fill_row(air.box, values, row_start(air.box, i, j), air.box.nz, lane, _sharpened, given)
 
 
-@kernel
-def _store(air: Air, values: Floats, spread: Floats):
-    for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
-        for n in range(lane_items(air.box, air.box.nz, lane)):
-            at = row_start(air.box, i, j) + lane_place(air.box, n, lane)
-            if not is_solid(air.solids, at):
-                values[at] = spread[at]
-
-
 @func
-def _spread_cell(k: ti.i32, i: ti.i32, j: ti.i32, air: Air, values: Floats, step: ti.f32) -> ti.f32:
+def _spread_cell(k: ti.i32, i: ti.i32, j: ti.i32, air: Air, values: Floats, room: Floats, step: ti.f32) -> ti.f32:
     at, here = row_start(air.box, i, j) + k, ti.Vector([i, j, k])
     lost = 0.0
     for axis in ti.static(range(3)):
@@ -127,13 +249,13 @@ def _spread_cell(k: ti.i32, i: ti.i32, j: ti.i32, air: Air, values: Floats, step
         lost += _given(at + along, here[axis] + 1, axis, air, values, step) - _given(
             at, here[axis], axis, air, values, step
         )
-    return values[at] - lost
+    return _size(air.solids, room, at) * values[at] - lost
 
 
 @func
 def _given(at: ti.i32, p: ti.i32, axis: ti.template(), air: Air, values: Floats, step: ti.f32) -> ti.f32:
     """What the donor gives through the face before the p-th cell along an axis, which is at `at`."""
-    crossed = step * _face_velocity(air, axis, at)
+    crossed = step * _face_flux(air, axis, at)
     before = ti.select(p > 1, values[at - steps(air.box)[axis]], 0.0)
     after = ti.select(p <= cell_counts(air.box)[axis], values[at], 0.0)
     return ti.max(crossed, 0.0) * before + ti.min(crossed, 0.0) * after
@@ -142,6 +264,11 @@ def _given(at: ti.i32, p: ti.i32, axis: ti.template(), air: Air, values: Floats,
 @func
 def _face_velocity(air: Air, axis: ti.template(), at: ti.i32) -> ti.f32:
     return ti.static((air.state.velocity.x, air.state.velocity.y, air.state.velocity.z)[axis])[at]
+
+
+@func
+def _face_flux(air: Air, axis: ti.template(), at: ti.i32) -> ti.f32:
+    return flux_part(air.solids, axis, at) * _face_velocity(air, axis, at)
 
 
 @func
@@ -166,22 +293,34 @@ def _flux(at: ti.i32, here, axis: ti.template(), air: Air, spread: Floats, step:
     if ti.static(axis == 0):
         ahead, behind = at + along * int(p < count[axis]), at - along - along * int(p > 2)
     bend = (spread[ahead] - spread[at]) - (spread[at - along] - spread[behind])
-    lean = ti.select((p > 2) & (p < count[axis]), crossed * (1.0 - moved) * (1.0 - 2.0 * moved) / 12.0, 0.0)
+    is_whole = True
+    if ti.static(air.solids.cuts):
+        is_whole = ((air.solids.words[at] | air.solids.words[at - along]) & NEAR_SOLIDS) == 0
+    is_far = is_whole & (p > 2) & (p < count[axis])
+    lean = ti.select(is_far, crossed * (1.0 - moved) * (1.0 - 2.0 * moved) / 12.0, 0.0)
     flux = 0.5 * moved * (1.0 - moved) * (spread[at] - spread[at - along]) - lean * bend
     for other in ti.static((axis + 1) % 3, (axis + 2) % 3):
         across, q = steps(air.box)[other], here[other]
         aside = _face_velocity(air, other, at) + _face_velocity(air, other, at + across)
         aside += _face_velocity(air, other, at - along) + _face_velocity(air, other, at - along + across)
         rise = (spread[at + across] - spread[at - across]) + (spread[at - along + across] - spread[at - along - across])
-        is_inner = (q > 1) & (q < count[other])
+        is_inner = is_whole & (q > 1) & (q < count[other])
         flux -= ti.select(is_inner, crossed * (step * aside) * rise / 32.0, 0.0)
     is_open = (p > 1) & (openness[at] > 0.0)
-    return ti.select(is_open, flux, 0.0)
+    return ti.select(is_open, flux_part(air.solids, axis, at) * flux, 0.0)
 
 
 @func
 def _kept_shares(
-    k: ti.i32, i: ti.i32, j: ti.i32, air: Air, values: Floats, spread: Floats, fluxes: Faces, step: ti.f32
+    k: ti.i32,
+    i: ti.i32,
+    j: ti.i32,
+    air: Air,
+    values: Floats,
+    spread: Floats,
+    fluxes: Faces,
+    volume: Floats,
+    step: ti.f32,
 ):
     """Shares of what leaves a cell and of what comes in that keep it in its range."""
     at, here = row_start(air.box, i, j) + k, ti.Vector([i, j, k])
@@ -194,10 +333,11 @@ def _kept_shares(
         losses += ti.max(-into, 0.0) + ti.max(out, 0.0)
         before = ti.select(here[axis] > 1, values[at - along], 0.0)
         after = ti.select(here[axis] < count, values[at + along], 0.0)
-        before = ti.select(step * _face_velocity(air, axis, at) > 0.0, before, values[at])
-        after = ti.select(step * _face_velocity(air, axis, at + along) < 0.0, after, values[at])
+        before = ti.select(step * _face_flux(air, axis, at) > 0.0, before, values[at])
+        after = ti.select(step * _face_flux(air, axis, at + along) < 0.0, after, values[at])
         low, high = ti.min(low, ti.min(before, after)), ti.max(high, ti.max(before, after))
-    return _share(spread[at] - low, losses), _share(high - spread[at], gains)
+    size = _size(air.solids, volume, at)
+    return _share(size * (spread[at] - low), losses), _share(size * (high - spread[at]), gains)
 
 
 @ti.func
@@ -213,9 +353,9 @@ def _sharpened(
     i: ti.i32,
     j: ti.i32,
     air: Air,
-    values: Floats,
     spread: Floats,
     fluxes: Faces,
+    volume: Floats,
     leaving: Floats,
     coming: Floats,
 ) -> ti.f32:
@@ -228,7 +368,9 @@ def _sharpened(
         change += _limited(flux[at], at, along, leaving, coming) - ti.select(
             here[axis] < cell_counts(air.box)[axis], out, 0.0
         )
-    return ti.select(is_solid(air.solids, at), values[at], spread[at] + change)
+    if ti.static(air.solids.cuts):
+        change = ti.select(volume[at] > 0.0, change / ti.max(volume[at], 1.0e-30), 0.0)
+    return spread[at] + change
 
 
 @func

@@ -11,7 +11,6 @@ from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart
-from sim.smoke.obstacles import MOVING
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
 
@@ -89,9 +88,8 @@ class HalfFullRoom:
         return dt
 
     def is_water(self) -> NDArray[np.bool_]:
-        """Of the cells."""
-        grid = self.smoke.grid
-        return grid.trim(self.smoke.obstacles.solids.state.to_numpy(), grid.cells) == MOVING
+        """Of the cells: whether more than half of them is water."""
+        return self.smoke.obstacles.open_volume() < 0.5
 
     def faces(self, axis: int) -> NDArray[np.float64]:
         """Velocity of the faces across an axis [m/s]."""

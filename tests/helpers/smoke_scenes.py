@@ -1,5 +1,7 @@
 """Small scenes that several smoke tests share."""
 
+from dataclasses import replace
+
 import numpy as np
 import taichi as ti
 
@@ -7,8 +9,9 @@ from sim.core.domain import Face
 from sim.shapes.parameters import Placement, SphereShape
 from sim.shapes.placement import build_solid
 from sim.smoke.arrays import Faces, new_faces, new_state
+from sim.smoke.cut_cells import FAR
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.obstacles import MOVING, Air, Obstacles
+from sim.smoke.obstacles import Air, Obstacles
 
 OPEN_BOX: tuple[Face, ...] = ("x-", "x+", "y-", "y+", "z+")
 CLOSED_BOX: tuple[Face, ...] = ()
@@ -17,12 +20,23 @@ CLOSED_BOX: tuple[Face, ...] = ()
 def unit_grid(cells: tuple[int, int, int], open_faces: tuple[Face, ...], *, obstacle: bool = False) -> SmokeGrid:
     """A box that is 1 m long in x, with a ball of 0.2 m in its middle if asked for."""
     cell_size = 1.0 / cells[0]
-    empty = SmokeGrid((0.0, 0.0, 0.0), cell_size, cells, frozenset(open_faces), np.zeros(cells, bool))
+    empty = SmokeGrid.of_cells((0.0, 0.0, 0.0), cell_size, cells, frozenset(open_faces))
     if not obstacle:
         return empty
     middle = tuple(0.5 * n * cell_size for n in cells)
-    ball = build_solid(Placement(shape=SphereShape(type="sphere", radius=0.2), position=middle))
-    return SmokeGrid(empty.origin, cell_size, cells, empty.open_faces, empty.cells_inside(ball))
+    return empty.with_solids([build_solid(Placement(shape=SphereShape(type="sphere", radius=0.2), position=middle))])
+
+
+def with_blocks(grid: SmokeGrid, solid: np.ndarray) -> SmokeGrid:
+    """A grid with whole cells that are solid, (nx, ny, nz) bool, and all whose corners those have."""
+    return replace(grid, distance=corner_distance(solid))
+
+
+def corner_distance(solid: np.ndarray) -> np.ndarray:
+    """Of the corners of cells from solid ones, (nx + 1, ..) [cells]: 1 outside, 0 on their surface, -1 inside."""
+    beside = np.pad(solid, 1, mode="edge").astype(np.int32)
+    count = sum(beside[a : a - 1 or None, b : b - 1 or None, c : c - 1 or None] for a, b, c in np.ndindex(2, 2, 2))
+    return np.where(count == 8, -1.0, np.where(count > 0, 0.0, 1.0)).astype(np.float32)
 
 
 def set_faces(grid: SmokeGrid, faces: Faces, values) -> None:
@@ -42,10 +56,24 @@ def openness_of(grid: SmokeGrid) -> Faces:
     return openness
 
 
+def areas_of(grid: SmokeGrid) -> Faces:
+    """Open parts of faces, 1 without solids."""
+    if grid.has_solids:
+        return Obstacles(grid).solids.area
+    areas = new_faces(grid.size)
+    for array in areas:
+        array.fill(1.0)
+    return areas
+
+
 def air_in(grid: SmokeGrid) -> Air:
     """Air at rest in a grid, without the solver around it."""
-    obstacles = Obstacles(grid)
-    return Air(obstacles.box, obstacles.solids, openness_of(grid), new_state(grid.size))
+    return air_around(Obstacles(grid))
+
+
+def air_around(obstacles: Obstacles) -> Air:
+    """Air at rest among obstacles."""
+    return Air(obstacles.box, obstacles.solids, openness_of(obstacles.grid), new_state(obstacles.grid.size))
 
 
 class Bytes:
@@ -77,10 +105,18 @@ def rough_velocity(grid: SmokeGrid) -> list[np.ndarray]:
     return values
 
 
-def mark(obstacles: Obstacles, solid: np.ndarray, velocity: tuple[float, float, float]) -> None:
-    """Mark cells, (nx, ny, nz) bool, as solid in the coming step, all with one velocity [m/s]; no solid is static."""
-    state = obstacles.marks.state.to_numpy()
-    state[obstacles.grid.pad(solid).ravel()] = MOVING
-    obstacles.marks.state.from_numpy(state)
+def mark(obstacles: Obstacles, distance: np.ndarray, velocity: tuple[float, float, float]) -> None:
+    """Mark the distances of corners, (nx + 1, ..) [cells], from a solid of one velocity [m/s]; no solid is static."""
+    padded = obstacles.marks.distance.to_numpy().reshape(obstacles.grid.padded)
+    padded[1:, 1:, 1:] = np.minimum(distance, FAR)
+    obstacles.marks.distance.from_numpy(padded.ravel())
     for array, value in zip(obstacles.marks.velocity, velocity, strict=True):
         array.fill(value)
+
+
+def block_distance(grid: SmokeGrid, low: tuple[float, ...], high: tuple[float, ...]) -> np.ndarray:
+    """Of the corners from a box between two corners in cells; infinity is beyond the sides."""
+    corners = np.stack(np.meshgrid(*(np.arange(n + 1.0) for n in grid.cells), indexing="ij"), axis=-1)
+    beyond = np.maximum(np.asarray(low) - corners, corners - np.asarray(high))
+    distance = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)
+    return np.maximum(distance, -FAR)

@@ -110,10 +110,8 @@ def _slope(positions: Array, axis: int, *, closed: bool) -> Array:
 
 def _grid(n: int, open_faces: tuple[Face, ...], *, ball: bool) -> SmokeGrid:
     cells = (n, n, n)
-    empty = SmokeGrid((0.0, 0.0, 0.0), 1.0 / n, cells, frozenset(open_faces), np.zeros(cells, bool))
-    if not ball:
-        return empty
-    return SmokeGrid(empty.origin, empty.cell_size, cells, empty.open_faces, empty.cells_inside(build_solid(BALL)))
+    empty = SmokeGrid.of_cells((0.0, 0.0, 0.0), 1.0 / n, cells, frozenset(open_faces))
+    return empty.with_solids([build_solid(BALL)]) if ball else empty
 
 
 class _Bench:
@@ -126,8 +124,9 @@ class _Bench:
 
         self._grid = grid
         self._faces = new_faces(grid.size)
+        self._obstacles = Obstacles(grid)
         self._projection = PressureProjection(
-            Obstacles(grid), self._faces, tolerance=tolerance, max_iterations=MAX_ITERATIONS
+            self._obstacles, self._faces, tolerance=tolerance, max_iterations=MAX_ITERATIONS
         )
 
     def project(self, flow: list[Array], iterations: int) -> float:
@@ -139,7 +138,11 @@ class _Bench:
         self._projection._max_iterations = iterations
         self._projection.project()
         faces = self.faces()
-        divergence = sum(np.diff(face, axis=axis) for axis, face in enumerate(faces))[~grid.solid]
+        fluxes = faces
+        if grid.has_solids:
+            parts = (grid.trim(a.to_numpy(), grid.face_shape(n)) for n, a in enumerate(self._obstacles.solids.area))
+            fluxes = [part * face for part, face in zip(parts, faces, strict=True)]
+        divergence = np.sum([np.diff(flux, axis=axis) for axis, flux in enumerate(fluxes)], axis=0)
         return float(np.abs(divergence).max() / max(np.abs(face).max() for face in faces))
 
     def faces(self) -> list[Array]:

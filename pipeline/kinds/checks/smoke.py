@@ -30,8 +30,8 @@ from sim.shapes.solid import Solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
 
-BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 320, 250
-"""Upper bounds: 171 for the solver and its couplings, and, where a CPU computes, 144 for the six snapshots and
+BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 374, 250
+"""Upper bounds: 214 for the solver and its couplings, and, where a CPU computes, 159 for the six snapshots and
 checkpoints that the simulation may hold at once; on a GPU these are not in its memory."""
 BYTES_PER_ROW_ON_GPU = 5 * 32 * 8
 """On top for each row of cells along z: five reductions (`sim.smoke.reductions`) of 32 lanes, two numbers each."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from half_full_rooms import SILENT_SOURCE, SPACING, HalfFullRoom, lattice
+from smoke_scenes import with_blocks
 
 from sim.core.domain import DomainParameters
 from sim.coupling.smoke_fluid import room_for_water
@@ -56,13 +57,13 @@ def test_beside_a_static_body_water_is_made_up_for_as_beside_a_wall(reach_in_cel
     size, floor = 0.02, 5
     solid = np.zeros((12, 12, 12), bool)
     solid[..., :floor] = True
-    none = np.zeros_like(solid)
     reach = reach_in_cells * size
     sides = ("x-", "x+", "y-", "y+", "z-", "z+")
     open_domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.24, 0.24, 0.24), open_faces=sides)
     tank = DomainParameters(min=(0.0, 0.0, floor * size), max=(0.24, 0.24, 0.24), open_faces=tuple(set(sides) - {"z-"}))
-    beside_body = room_for_water(SmokeGrid((0.0, 0.0, 0.0), size, solid.shape, frozenset(), solid), open_domain, reach)
-    beside_wall = room_for_water(SmokeGrid((0.0, 0.0, 0.0), size, solid.shape, frozenset(), none), tank, reach)
+    empty = SmokeGrid.of_cells((0.0, 0.0, 0.0), size, solid.shape, frozenset())
+    beside_body = room_for_water(with_blocks(empty, solid), open_domain, reach)
+    beside_wall = room_for_water(empty, tank, reach)
     assert beside_wall[5, 5, floor] < 0.9
     # Cells beside the sides of the box do not know of the body beyond; walls are in single precision.
     inner = slice(4, -4)

@@ -12,7 +12,6 @@ from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
 from sim.shapes.body_geometry import BodyGeometry
-from sim.smoke.obstacles import AIR, MOVING, STATIC
 from sim.smoke.parameters import SmokeParameters
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -59,25 +58,26 @@ def test_a_piston_pushes_air_out_of_a_channel_at_its_own_speed_until_it_has_left
     for frame in range(1, 7):
         numbers = world.advance_frame().diagnostics["air"]
         u, v, w = face_velocities(smoke)
-        # The box ends at 0.255 m + 0.02 m a frame; cells are in it whose centres are.
-        end = np.count_nonzero((np.arange(16) + 0.5) / 16 < 0.255 + 0.02 * frame)
-        assert (~smoke.obstacles.is_air()).sum() == end * 64
+        # The box ends at 0.255 m + 0.02 m a frame.
+        length = (0.255 + 0.02 * frame) * 16
+        assert (1.0 - smoke.obstacles.open_volume()).sum() == pytest.approx(length * 64, rel=1.0e-4)
+        end = int(np.ceil(length))
         # Each of up to 12 cells may add its part of the divergence.
         assert np.abs(u[end:] - speed).max() < 12 * TOLERANCE * speed
         assert max(np.abs(v[end:]).max(), np.abs(w[end:]).max()) < 12 * TOLERANCE * speed
         assert numbers["compression"] == 0.0
-    assert numbers["covered_mass"] == 0.0
     for _ in range(60):
         numbers = world.advance_frame().diagnostics["air"]
         assert numbers["not_converged"] == 0.0
     assert smoke.obstacles.is_air().all()
-    # It has swept the channel, and smoke was in its way.
-    assert numbers["covered_mass"] > 0.0
+    # It has swept the channel, and pushed out the smoke that was in its way; what is there was emitted behind it.
+    assert numbers["mass"] < 0.5 * numbers["emitted_mass"]
     world.restore(0, start)
 
 
 @pytest.mark.slow
-def test_a_body_that_rests_acts_as_a_static_one_to_the_bit():
+def test_a_body_that_rests_acts_as_a_static_one():
+    """But for rounding: distances from static bodies are found in double precision, from others in single."""
     ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.13}, "position": (0.52, 0.27, 0.26)}
     states = []
     for kind in ("static", "kinematic"):
@@ -87,7 +87,8 @@ def test_a_body_that_rests_acts_as_a_static_one_to_the_bit():
         states.append(world.checkpoint())
     assert np.abs(states[0]["air/w_face_z"]).max() > 0.01
     for name in ("u_face_x", "v_face_y", "w_face_z", "density", "excess_temperature"):
-        assert np.array_equal(states[0][f"air/{name}"], states[1][f"air/{name}"]), name
+        largest = np.abs(states[0][f"air/{name}"]).max()
+        np.testing.assert_allclose(states[1][f"air/{name}"], states[0][f"air/{name}"], atol=2.0e-4 * largest, rtol=0.0)
 
 
 SHAPES = (
@@ -103,7 +104,7 @@ SHAPES = (
 )
 
 
-def test_cells_whose_centres_are_in_a_body_are_solid_and_have_its_velocity():
+def test_corners_have_their_distance_from_the_nearest_body_and_its_velocity():
     bodies = [
         {
             "name": f"body{number}",
@@ -123,30 +124,32 @@ def test_cells_whose_centres_are_in_a_body_are_solid_and_have_its_velocity():
     world = build([*bodies, post], cells=40, size=(1.0, 1.0, 1.0))
     smoke, rigid = smoke_of(world), world.solvers["rigid"]
     grid, state = smoke.grid, rigid.bodies
-    centres = grid.cell_centres()
-    kind = grid.trim(smoke.obstacles.solids.state.to_numpy(), grid.cells).ravel()
-    assert np.array_equal(kind == STATIC, grid.solid.ravel())
-    solid = kind != AIR
-    velocity = np.stack(
-        [grid.trim(array.to_numpy(), grid.cells).ravel() for array in smoke.obstacles.solids.velocity], axis=1
+    solids = smoke.obstacles.solids
+    found, *velocity = (
+        array.to_numpy().reshape(grid.padded)[1:, 1:, 1:] for array in (solids.distance, *solids.velocity)
     )
-    covered = np.zeros(len(centres), bool)
+    corners = np.stack(np.meshgrid(*(np.arange(41) / 40,) * 3, indexing="ij"), axis=-1)
+    distances = [grid.distance.astype(np.float64)]
     for number, geometry in enumerate(rigid.solids):
-        arm = centres - state.position[number]
-        near = np.linalg.norm(arm, axis=1) < geometry.radius + grid.cell_size
-        distance = np.full(len(centres), np.inf)
-        distance[near] = geometry.signed_distance(arm[near] @ rotation.matrices(state.orientation[number]))
-        # Distances of meshes come from a grid whose cells are a fortieth of the longest edge or so.
-        slack = 0.01 if SHAPES[number][0]["type"] == "bunny" else 1.0e-6
-        inside = distance < -slack
-        assert solid[inside].all()
-        covered |= distance < slack
-        moving = inside & (kind == MOVING)
-        assert moving.sum() > 20
-        expected = state.velocity[number] + np.cross(state.angular_velocity[number], arm[moving])
+        arm = corners - state.position[number]
+        distances.append(np.full(found.shape, 9.0))
+        near = np.linalg.norm(arm, axis=-1) < geometry.radius + grid.cell_size
+        distances[-1][near] = geometry.signed_distance(arm[near] @ rotation.matrices(state.orientation[number])) * 40
+    nearest, expected = np.argmin(distances, axis=0), np.min(distances, axis=0)
+    # Where cells are cut; distances of meshes come from a grid whose cells are a fortieth of the longest edge or so.
+    cut = np.abs(expected) < 0.7
+    slack = np.where(nearest == 7, 0.4, 2.0e-4)
+    assert (np.abs(found - expected) < slack)[cut].all()
+    second = np.partition(distances, 1, axis=0)[1]
+    for number in range(len(distances)):
+        mine = cut & (nearest == number) & (second - expected > 0.5)
+        assert mine.sum() > 20
+        own = np.zeros(3)
+        if number:
+            arm = corners[mine] - state.position[number - 1]
+            own = state.velocity[number - 1] + np.cross(state.angular_velocity[number - 1], arm)
         # Single precision of speeds of about 1 m/s.
-        assert np.abs(velocity[moving] - expected).max() < 1.0e-6
-    assert not (kind == MOVING)[~covered].any()
+        assert np.abs(np.stack([each[mine] for each in velocity], axis=-1) - own).max() < 1.0e-6
 
 
 PLATE = {"name": "plate", "kind": "kinematic", "shape": {"type": "box", "size": (0.05, 0.3, 0.3)}}
@@ -232,7 +235,8 @@ def velocity_ahead_of_a_sphere(cells: int) -> np.ndarray:
     """Along the path of a sphere of 1/8 m that has just started to move in still air, over its own velocity."""
     speed = 0.3
     ball = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.125}}
-    ball |= {"position": (0.5 - speed / FPS, 0.5, 0.5), "velocity": (speed, 0.0, 0.0)}
+    # Air flows as around the middle of its way.
+    ball |= {"position": (0.5 - 0.5 * speed / FPS, 0.5, 0.5), "velocity": (speed, 0.0, 0.0)}
     world = build(
         [ball],
         cells=cells,
@@ -244,7 +248,14 @@ def velocity_ahead_of_a_sphere(cells: int) -> np.ndarray:
     )
     numbers = world.advance_frame().diagnostics["air"]
     assert numbers["residual"] <= TOLERANCE
-    u, v, w = (face / speed for face in face_velocities(smoke_of(world)))
+    smoke = smoke_of(world)
+    areas = (
+        smoke.grid.trim(area.to_numpy(), smoke.grid.face_shape(axis))
+        for axis, area in enumerate(smoke.obstacles.solids.area)
+    )
+    u, v, w = (
+        np.where(area > 0.0, face / speed, 0.0) for face, area in zip(face_velocities(smoke), areas, strict=True)
+    )
     # The flow is that of a dipole: the same ahead and behind, left and right, and about its axis; the projection's
     # tolerance, summed over the cells of a side.
     slack = cells * TOLERANCE
@@ -265,10 +276,10 @@ def test_air_flows_around_a_sphere_as_around_a_dipole(cells):
     ahead = velocity_ahead_of_a_sphere(cells)
     distance = np.arange(cells + 1) / cells - 0.5
     near = (distance > 1.4 * radius) & (distance < 2.1 * radius)
-    # u = U (R/r)³ on the axis, with the radius that the air sees. A staircase's is within half a cell of the sphere's;
-    # measured: 0.25 cells more at 32 cells a metre, 0.19 at 64. Images behind the walls add less than 0.1 cells.
+    # u = U (R/r)³ on the axis, with the radius that the air sees. A staircase's was 0.25 cells larger at 32 cells a
+    # metre, 0.19 at 64. What is left here, 0.14 and 0.20 cells less, is of images behind the walls.
     excess = np.cbrt(ahead[near]) * distance[near] - radius
-    assert np.abs(excess).max() * cells < 0.5
+    assert np.abs(excess).max() * cells < 0.25
 
 
 @pytest.mark.slow
@@ -290,8 +301,6 @@ def test_a_ball_that_flies_through_a_layer_of_smoke_keeps_its_mass():
     before = world.diagnostics()["air"]["mass"]
     for _ in range(34):
         numbers = world.advance_frame().diagnostics["air"]
-    # It has bored a hole of its own diameter, whose smoke would be 6 % of the layer. Dropping what it covers makes up
-    # for what has come through its moving side: measured, 0.7 % of the mass are too much in the end.
-    bored = np.pi * 0.14**2 * 0.2
-    assert numbers["covered_mass"] > bored
-    assert numbers["mass"] == pytest.approx(before, rel=0.01)
+    # It bores a hole of its own diameter, whose smoke would be 6 % of the layer. Cells that were solid as a whole made
+    # 0.7 % too much.
+    assert numbers["mass"] == pytest.approx(before, rel=0.001)  # measured: 0.04 % more

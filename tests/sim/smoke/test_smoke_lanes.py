@@ -119,12 +119,13 @@ def test_a_plume_is_the_same_with_one_thread_a_row_and_with_many(monkeypatch, ch
             solids=[] if moves else [ball],
             moving=moves,
         )
-        centres = solver.grid.cell_centres().reshape(*solver.grid.cells, 3)
+        axes = (low + np.arange(n + 1) / 18 for low, n in zip(solver.grid.origin, solver.grid.cells, strict=True))
+        corners = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         for step in range(5):
             if moves:
                 # Two thirds of a cell a step.
-                away = np.linalg.norm(centres - (-0.3 + step / 27, 0.0, 0.25), axis=-1)
-                mark(solver.obstacles, away < 0.15, (60 / 27, 0.0, 0.0))
+                away = np.linalg.norm(corners - (-0.3 + step / 27, 0.0, 0.25), axis=-1)
+                mark(solver.obstacles, (away - 0.15) * 18, (60 / 27, 0.0, 0.0))
             solver.substep(1 / 60)
         assert solver.diagnostics()["not_converged"] == 0.0
         states.append(solver.checkpoint())

@@ -111,14 +111,21 @@ def test_air_goes_around_solids_and_no_smoke_is_in_them(solver):
     advance(solver, 40)
     snapshot = solver.snapshots()["plume"]
     solid = solver.grid.solid
-    assert solid.sum() > 20
+    assert (1.0 - solver.obstacles.open_volume()).sum() > 20
     assert not snapshot.arrays["density"][solid].any()
     assert (snapshot.arrays["temperature"][solid] == np.float32(293.0)).all()
     assert not snapshot.arrays["velocity"][solid].any()
-    state = solver.checkpoint()
-    surface = solid[:, :, 1:] != solid[:, :, :-1]
-    w = solver.grid.trim(state["w_face_z"], solver.grid.face_shape(2))
-    assert not w[:, :, 1:-1][surface].any()
+    # Nothing crosses its surface: what flows through the open faces of a cell that it cuts is all.
+    flux = 0.0
+    for axis, (name, area) in enumerate(
+        zip(("u_face_x", "v_face_y", "w_face_z"), solver.obstacles.solids.area, strict=True)
+    ):
+        shape = solver.grid.face_shape(axis)
+        through = (solver.grid.trim(values, shape) for values in (area.to_numpy(), solver.checkpoint()[name]))
+        flux = flux + np.diff(np.prod([each.astype(np.float64) for each in through], axis=0), axis=axis)
+    cut = (solver.obstacles.open_volume() < 1.0) & ~solid
+    assert cut.sum() > 20
+    assert np.abs(flux[cut]).max() < 1.1e-5 * solver.diagnostics()["max_speed"]
     # Beside the ball the plume passes; its cells there do move.
     assert np.abs(snapshot.arrays["velocity"][..., 2])[~solid].max() > 0.1
 
@@ -169,7 +176,7 @@ def test_a_cold_source_sinks():
 
 
 def test_an_obstacle_that_falls_between_the_cells_is_refused():
-    plate = build_solid(Placement(shape={"type": "box", "size": (0.4, 0.4, 0.01)}, position=(0.0, 0.0, 0.625)))
+    plate = build_solid(Placement(shape={"type": "box", "size": (0.4, 0.4, 0.01)}, position=(0.0, 0.0, 0.65625)))
     with pytest.raises(ValueError, match=r"0\.01 m thin falls between its cells of 0\.0625 m"):
         SmokeGrid.build(plume(), DOMAIN, [plate])
 
@@ -188,7 +195,7 @@ def test_a_checkpoint_of_another_grid_is_refused(solver):
     with pytest.raises(ValueError, match=r"density must have shape \(18, 18, 26\), got shape \(2, 2, 2\)"):
         solver.restore({**state, "density": np.zeros((2, 2, 2), np.float32)})
     del state["clock"]
-    with pytest.raises(ValueError, match=r"clock must have shape \(4,\), got nothing"):
+    with pytest.raises(ValueError, match=r"clock must have shape \(2,\), got nothing"):
         solver.restore(state)
 
 

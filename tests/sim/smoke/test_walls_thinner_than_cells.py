@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import trimesh
-from scipy import ndimage
 
 from sim.core.domain import DomainParameters
 from sim.shapes.parameters import Placement
@@ -30,14 +29,14 @@ def plate(thickness: float, **where):
 
 def is_tight(solid) -> bool:
     """Whether no air gets from below to above it, from cell to cell through faces."""
-    number, _ = ndimage.label(~SmokeGrid.build(AIR, DOMAIN, [solid]).solid)
+    number = SmokeGrid.build(AIR, DOMAIN, [solid]).air_regions()
     return number[25, 25, 2] != number[25, 25, 47]
 
 
 @pytest.mark.parametrize("thickness", [0.008, 0.012, 0.019])
 def test_of_a_turned_plate_cells_miss_what_its_thickness_leaves_of_a_column(thickness):
     solid = plate(thickness, rotation_deg=(20.0, 12.0, 0.0))
-    # A column along z crosses it over d / n_z, and holds a centre every 0.02 m.
+    # A column along z crosses it over d / n_z, and holds a corner every 0.02 m.
     normal_z = np.cos(np.deg2rad(20.0)) * np.cos(np.deg2rad(12.0))
     expected = max(0.0, 1.0 - thickness / normal_z / 0.02)
     found = thin_walls(solid, AIR, DOMAIN)
@@ -47,23 +46,27 @@ def test_of_a_turned_plate_cells_miss_what_its_thickness_leaves_of_a_column(thic
         assert found.thickness == pytest.approx(thickness, rel=0.01)
 
 
-def test_a_thin_plate_along_a_layer_of_cells_is_seen_whole():
-    solid = plate(0.01, position=(0.0, 0.0, 0.51))
+def test_a_thin_plate_along_a_layer_of_corners_is_seen_whole():
+    solid = plate(0.01, position=(0.0, 0.0, 0.5))
     assert is_tight(solid)
     assert thin_walls(solid, AIR, DOMAIN).share == 0.0
 
 
 def test_the_rim_that_cells_cut_off_a_small_plate_is_no_hole():
     """From -0.15 to 0.15 m, of which cells of 0.04 m show what is between -0.14 and 0.14 m."""
-    small = placed({"type": "box", "size": (0.3, 0.3, 0.03)})
+    small = placed({"type": "box", "size": (0.3, 0.3, 0.03)}, position=(0.0, 0.0, 0.48))
     assert thin_walls(small, AIR.model_copy(update={"cell_size": 0.04}), DOMAIN).share == 0.0
 
 
 def test_a_slab_on_a_closed_side_lets_nothing_through():
-    slab = plate(0.016, position=(0.0, 0.0, 0.0))  # 8 mm of it in the box, below the first centres
+    slab = plate(0.016, position=(0.0, 0.0, 0.0))  # 8 mm of it in the box, with the corners in the side
     assert thin_walls(slab, AIR, DOMAIN).share == 0.0
     open_below = AIR.model_copy(update={"open_faces": ("z-",)})
-    assert thin_walls(slab, open_below, DOMAIN).share == 1.0
+    assert thin_walls(slab, open_below, DOMAIN).share == 0.0
+    assert not SmokeGrid.build(open_below, DOMAIN, [slab]).open_area[2][..., 0].any()
+    above = plate(0.016, position=(0.0, 0.0, 0.01))  # between the side and the next corners
+    assert thin_walls(above, AIR, DOMAIN).share == 0.0
+    assert thin_walls(above, open_below, DOMAIN).share == 1.0
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +81,7 @@ def room(tmp_path_factory):
 
 def test_of_a_hollow_mesh_its_walls_count_and_not_its_box(room):
     solid = placed(room, position=(0.005, 0.003, 0.5))
-    number, _ = ndimage.label(~SmokeGrid.build(AIR, DOMAIN, [solid]).solid)
+    number = SmokeGrid.build(AIR, DOMAIN, [solid]).air_regions()
     assert number[25, 25, 25] == number[1, 1, 1]  # smoke leaves the room
     found = thin_walls(solid, AIR, DOMAIN)
     assert found.share > 0.4
