@@ -10,8 +10,9 @@ from scipy.spatial import cKDTree
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
 from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over, note_gaps
+from pipeline.kinds.checks.cloth_joints import check_joints_of_cloth
 from pipeline.kinds.checks.cloth_start import ClothStart, start_cloths
-from pipeline.kinds.checks.joints import check_joints_of_cloth, joined_to
+from pipeline.kinds.checks.joints import joined_to
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.pins import check_pin_load, check_pin_speeds, check_pin_times
 from pipeline.model.amounts import count

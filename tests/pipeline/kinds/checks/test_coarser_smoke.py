@@ -47,8 +47,8 @@ def preview(text, folder):
         (PLUME, 0.04),
         # It is from 0.025 to 0.055 m; centres of cells are at 0.02 and 0.06 m, or at 0.0525 m.
         (THIN_SOURCE, 0.035),
-        (PLUME + PADDLE.replace("0.505", "0.5"), 0.04),  # a centre of such cells lies in it
-        (PLUME + PADDLE.replace("0.505", "0.52"), 0.035),
+        (PLUME + PADDLE.replace("0.505", "0.5"), 0.035),
+        (PLUME + PADDLE.replace("0.505", "0.52"), 0.04),  # corners of such cells lie in it
         (PLUME + PADDLE + MOVES, 0.03),
         (PLUME + LEANING, 0.025),
         (PLUME + LEANING + MOVES, 0.025),

@@ -15,11 +15,12 @@ name = "plate"
 shape = { type = "box", size = [0.9, 0.9, 0.01] }
 position = [0.0, 0.0, 0.5]
 """
+BETWEEN = PLATE.replace("0.0, 0.5]", "0.0, 0.51]")  # the corners of cells
 TURNED = "rotation_deg = [20.0, 12.0, 0.0]\n"
 
 
 def test_a_flat_static_plate_between_the_cells_is_refused_with_its_name(tmp_path):
-    (error,) = checked(PLUME + PLATE, tmp_path / "flat.toml").errors
+    (error,) = checked(PLUME + BETWEEN, tmp_path / "flat.toml").errors
     assert says(error, 'flat.toml:15 rigid[0]: is 0.01 m thin ... between the cells of smoke "plume", 0.02 m')
 
 
@@ -43,7 +44,7 @@ def test_a_thin_plate_in_a_side_of_the_box_passes_without_a_word(changes, body, 
 
 def test_wind_past_such_a_plate_is_one_error(tmp_path):
     windy = PLUME.replace("cell_size = 0.02", "cell_size = 0.02\nwind = [1.0, 0.0, 0.0]")
-    assert len(checked(windy + PLATE, tmp_path / "flat.toml").errors) == 1
+    assert len(checked(windy + BETWEEN, tmp_path / "flat.toml").errors) == 1
 
 
 def test_a_static_plate_that_leaks_is_told_with_the_cells_that_would_not(tmp_path):
