@@ -169,7 +169,7 @@ def test_smoke_is_pushed_out_by_what_a_body_gains(files):
         "smoke": [
             {
                 "name": "air",
-                "cell_size": 0.6 / 32,
+                "cell_size": 0.6 / 64,
                 "open_faces": ("x+",),
                 "source": [{"shape": {"type": "sphere", "radius": 0.04}, "position": (0.5, 0.15, 0.15)}],
             }
@@ -182,7 +182,7 @@ def test_smoke_is_pushed_out_by_what_a_body_gains(files):
         world.advance_frame()
         flux = smoke.grid.trim(smoke.checkpoint()["u_face_x"], smoke.grid.face_shape(0))[-1].sum()
         out += float(flux) * smoke.grid.cell_size**2 / 60.0
-    # Cells are full or empty, which makes steps of a flow that grows evenly.
+    # The part that a ball leaves open of cells is known to second order of their size: 4 % are lost with half as many.
     assert out == pytest.approx(growth_of(0.06 * (1.0 + 24 / 60.0)), rel=0.02)
 
 
