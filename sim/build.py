@@ -232,16 +232,14 @@ def _build_smoke(
     smoke: SmokeParameters, scene: SceneParameters, static: Sequence[StaticBody], forces: ForceField | None
 ) -> SmokeSolver:
     """The solver of one smoke, with static bodies in it, and room for what will move in it."""
-    solver = SmokeSolver(
+    return SmokeSolver(
         with_sources_on(smoke, scene.rigid),
         domain=scene.domain,
         gravity=scene.gravity,
         solids=[body.solid for body in static],
         moving=_meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
+        forces=forces,
     )
-    if forces is not None:
-        solver.feel(forces)
-    return solver
 
 
 def _meets_fluid(smoke: SmokeParameters, scene: SceneParameters) -> bool:

@@ -8,6 +8,7 @@ from sim.core.bundles import func
 from sim.core.water import TENSION_OF_WATER
 
 AIR_VISCOSITY = 1.82e-5  # dynamic, at 20 degrees C [Pa s]
+AIR_DENSITY = 1.2  # likewise [kg/m³]
 FLATTENING = 1.0 / 12.0  # y over the Weber number of the radius, in a steady stream (TAB model, O'Rourke & Amsden 1987)
 FLAT_DRAG = 2.632  # growth of C_D with the flattening (Liu, Mather & Reitz 1993, eq. 7) [-]
 LEAST_REYNOLDS = 1.0e-6  # keeps the coefficient finite at rest; drag is linear in speed far above

@@ -32,6 +32,14 @@ def hash_to_unit(key: ti.u32):
     return ti.cast(hash_bits(key) >> ti.u32(8), ti.f32) / 16777216.0
 
 
+@ti.func
+def hash_to_smooth(time: ti.f32, salt: ti.i32):
+    """A number in [0, 1) that changes smoothly and takes new values at every whole time, as `smooth_noise`."""
+    tick = ti.floor(time, ti.i32)
+    first, last = hash_to_unit(ti.cast(salt ^ tick, ti.u32)), hash_to_unit(ti.cast(salt ^ (tick + 1), ti.u32))
+    return first + (last - first) * (0.5 - 0.5 * ti.cos(ti.math.pi * (time - ti.cast(tick, ti.f32))))
+
+
 def spread(seed: int) -> int:
     """32 bits by which to change the keys of a hash; 0 for seed 0."""
     return seed * GOLDEN & ALL_BITS

@@ -342,12 +342,5 @@ def _expected_speed(start: FluidStart, stress: float) -> float:
         start.gravity,
         cohesion_stress=stress,
         body_speed=start.body_speed,
-        outer_acceleration=_outer_acceleration(start),
+        outer_acceleration=start.outer_forces.largest_acceleration,
     )
-
-
-def _outer_acceleration(start: FluidStart) -> float:
-    """Largest acceleration by forces from outside [m/s²]."""
-    if start.forces is None:
-        return 0.0
-    return start.forces.on([(fluid.name,) for fluid in start.fluids]).largest_acceleration

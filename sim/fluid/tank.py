@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ from sim.fluid.kernels import Discretization
 from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
 from sim.fluid.sheets import SheetForces
 from sim.fluid.stepping import MotionSummary, ParticleStepper, box_of
-from sim.forces.field import ForceField
+from sim.forces.field import ForceField, ForcesOn
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -58,6 +59,11 @@ class FluidStart:
     carriers: Mapping[str, Carrier] = field(default_factory=dict)  # and which of the moving bodies they are
     capacity: int | None = None  # most particles that there can ever be; those at the start if omitted
     forces: ForceField | None = None  # from outside; none if omitted
+
+    @cached_property
+    def outer_forces(self) -> ForcesOn:
+        """Those from outside on these fluids."""
+        return (self.forces or ForceField(())).on([(fluid.name,) for fluid in self.fluids])
 
 
 class ParticleTank:
@@ -98,7 +104,7 @@ class ParticleTank:
         _check_particles(start)
         self.gravity, self.discretization, self._materials = start.gravity, discretization, phases.materials
         self._looks_ahead = looks_ahead
-        self.outer_forces = (start.forces or ForceField(())).on([(fluid.name,) for fluid in start.fluids])
+        self.outer_forces = start.outer_forces
         self.removed = 0
         self._travelled = self._boundary_travelled = 0.0
         self.body_speed = self.sheet_speed = 0.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers, on_device
 from sim.core.bundles import bundle, func
-from sim.core.hashed_numbers import hash_to_unit, spread
+from sim.core.hashed_numbers import hash_to_smooth, spread
 from sim.core.motion import rotation
 from sim.forces.parameters import (
     AirForce,
@@ -207,19 +207,9 @@ def gusty(forces: ForceTable, f: ti.i32, x: ti.math.vec3) -> ti.math.vec3:
     wind = _vector(forces, row + VECTOR)
     if forces.numbers[row + GUSTS] > 0.0:
         late = x.dot(wind) / ti.max(wind.norm_sqr(), 1.0e-12)
-        gust = smooth_noise((forces.time_s - late) / forces.numbers[row + GUST_S], forces.salts[f])
-        wind *= 1.0 + forces.numbers[row + GUSTS] * gust
+        gust = hash_to_smooth((forces.time_s - late) / forces.numbers[row + GUST_S], forces.salts[f])
+        wind *= 1.0 + forces.numbers[row + GUSTS] * (2.0 * gust - 1.0)
     return wind
-
-
-@func
-def smooth_noise(time: ti.f32, salt: ti.i32) -> ti.f32:
-    """A number from -1 to 1 that changes smoothly and takes new values at every whole time."""
-    tick = ti.floor(time, ti.i32)
-    part = 0.5 - 0.5 * ti.cos(ti.math.pi * (time - ti.cast(tick, ti.f32)))
-    first = hash_to_unit(ti.cast(salt ^ tick, ti.u32))
-    last = hash_to_unit(ti.cast(salt ^ (tick + 1), ti.u32))
-    return 2.0 * (first + (last - first) * part) - 1.0
 
 
 @func

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Literal, Self
 
-import numpy as np
 from pydantic import Field, model_validator
 
-from sim.core.motion.parameters import RampPointParameters, require_ascending_times
+from sim.core.motion.parameters import RampPointParameters, require_ascending_times, strength_at
 from sim.core.parameters import KeyRefusedError, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import BoxShape, CylinderShape, SphereShape
 
@@ -59,10 +58,7 @@ class BaseForce(Parameters):
         """By its times and its ramp at a simulated time [s], from 0 to 1."""
         if time_s < self.start_s or (self.end_s is not None and time_s >= self.end_s):
             return 0.0
-        if not self.ramp:
-            return 1.0
-        times, strengths = [point.time_s for point in self.ramp], [point.strength for point in self.ramp]
-        return float(np.interp(time_s, times, strengths))
+        return strength_at(self.ramp, time_s)
 
 
 class GravityForce(BaseForce):

@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.drag import AIR_DENSITY
 from sim.forces.field import ForcesOn
-from sim.rigid.air_kernels import push_bodies
+from sim.rigid.air_kernels import Samples, push_bodies
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.states import MovingBodies
 from sim.shapes.body_geometry import BodyGeometry
 
 SAMPLES = 128
 """Most points of a body's surface at which it feels the air."""
-AIR_DENSITY = 1.2  # at 20 degrees C [kg/m³]
 FELT_ASLEEP = 0.1
 """Part of gravity from which on forces wake bodies, and keep them awake [-]: bodies at rest under less may sleep."""
 
 Float64Array = NDArray[np.float64]
-
-
-class Samples(NamedTuple):
-    """Points of a surface, with what air presses on."""
-
-    points: Float64Array  # [m], (m, 3)
-    normals: Float64Array  # outwards, (m, 3)
-    areas: Float64Array  # [m²], (m,)
 
 
 NO_SAMPLES = Samples(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))
@@ -51,42 +42,24 @@ class OuterForces:
         self, forces: ForcesOn, parameters: Sequence[RigidBodyParameters], solids: Sequence[BodyGeometry]
     ) -> None:
         self._forces = forces
-        self._drag = np.array([body.air_drag for body in parameters])
-        if not forces.blows:
-            self._drag[:] = 0.0
-        of_solid: dict[int, Samples] = {}  # bodies of a group share theirs
-        for solid in solids:
-            if forces.blows and id(solid) not in of_solid:
-                of_solid[id(solid)] = surface_of(solid)
-        found = [of_solid[id(solid)] for solid in solids] if forces.blows else [NO_SAMPLES]
+        drag = np.array([body.air_drag if forces.blows else 0.0 for body in parameters])
+        self._drag = 0.5 * AIR_DENSITY * drag
+        of_solid = {solid: surface_of(solid) for solid in dict.fromkeys(solids)} if forces.blows else {}
+        found = [of_solid[solid] for solid in solids] if forces.blows else [NO_SAMPLES]
         self._samples = Samples(*map(np.concatenate, zip(*found, strict=True)))
 
     def push(self, bodies: MovingBodies, gravity: Float64Array, dt: float) -> None:
         """Let them act on dynamic bodies for dt [s]."""
-        impulses, lost = np.zeros((len(bodies), 6)), np.zeros(len(bodies))
-        push_bodies(
-            self._forces.now,
-            *self._samples,
-            0.5 * AIR_DENSITY * self._drag,
-            bodies.position,
-            bodies.orientation,
-            bodies.velocity,
-            bodies.angular_velocity,
-            bodies.inverse_mass,
-            bodies.inverse_inertia().reshape(-1, 9),
-            dt,
-            impulses,
-            lost,
-        )
-        felt = np.sqrt(np.square(impulses[:, :3]).sum(axis=1)) * bodies.inverse_mass
-        wakes = felt > FELT_ASLEEP * dt * np.sqrt(np.square(gravity).sum())
-        impulses[~bodies.is_free | (bodies.is_asleep & ~wakes)] = 0.0
-        bodies.wake(bodies.is_asleep & wakes)
-        bodies.is_pushed = bodies.is_pushed | impulses.any(axis=1) | (lost > 0.0)
+        change, lost = np.zeros((len(bodies), 6)), np.zeros(len(bodies))
+        push_bodies(self._forces.now, self._samples, self._drag, bodies.moving(), dt, change, lost)
+        felt = np.sqrt(np.square(change[:, :3]).sum(axis=1))
+        wakes = bodies.is_asleep & (felt > FELT_ASLEEP * dt * np.sqrt(np.square(gravity).sum()))
+        bodies.wake(wakes)
+        change[bodies.is_asleep] = lost[bodies.is_asleep] = 0.0
+        bodies.is_pushed = bodies.is_pushed | change.any(axis=1) | (lost > 0.0)
         kept = 1.0 - lost[:, None]
-        bodies.velocity = kept * bodies.velocity + bodies.inverse_mass[:, None] * impulses[:, :3]
-        turned = np.einsum("nij,nj->ni", bodies.inverse_inertia(), impulses[:, 3:])
-        bodies.angular_velocity = kept * bodies.angular_velocity + turned
+        bodies.velocity = kept * bodies.velocity + change[:, :3]
+        bodies.angular_velocity = kept * bodies.angular_velocity + change[:, 3:]
 
 
 def surface_of(solid: BodyGeometry) -> Samples:

@@ -317,6 +317,12 @@ def sweep(
     return largest, square
 
 
+@ti.func
+def ratio_of(square: ti.f64, before: ti.f64) -> ti.f64:
+    """How far to go on along the direction before, by the squares of two gradients; 0, anew, where they grow."""
+    return ti.select(0.0 < square < before, square / ti.max(before, ti.cast(1.0e-300, ti.f64)), 0.0)
+
+
 @func
 def relax_contacts(
     rubs: ti.template(),
@@ -361,10 +367,7 @@ def relax_contacts(
         if ti.max(largest, by_joints) <= may_change:
             taken = number + 1
             break
-        ratio = 0.0
-        if 0.0 < square < square_before:
-            ratio = square / square_before
-        square_before = square
+        ratio, square_before = ratio_of(square, square_before), square
         if number < most - 1:
             for place in range(first_mover, last_mover):
                 body = islands.movers[place]

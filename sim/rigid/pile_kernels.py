@@ -27,6 +27,7 @@ from sim.rigid.contact_kernels import (
     gather_contact,
     join,
     push_both,
+    ratio_of,
     relax_pair,
     row_of,
     vector_of,
@@ -362,8 +363,8 @@ def begin_sweep(
         is_done = was_done or is_small or sweep >= pile.islands[island, MOST]
         ratio = ti.cast(0.0, ti.f64)
         square, square_before = pile.islands[island, SQUARE + last], pile.islands[island, SQUARE + before_last]
-        if sweep > 1 and 0 < square < square_before:
-            ratio = ti.cast(square, ti.f64) / ti.cast(square_before, ti.f64)
+        if sweep > 1:
+            ratio = ratio_of(ti.cast(square, ti.f64), ti.cast(square_before, ti.f64))
         if not is_done:
             for column in ti.static(range(6)):
                 now = velocity[body][column]
@@ -525,10 +526,7 @@ def relax_island(
         if largest <= may_change:
             taken = sweep + 1
             break
-        ratio = 0.0
-        if 0.0 < square < square_before:
-            ratio = square / square_before
-        square_before = square
+        ratio, square_before = ratio_of(square, square_before), square
     pile.islands[island, TAKEN + solve] = taken
 
 

@@ -108,7 +108,7 @@ class MovingBodies:
         inverse = np.einsum("nij,njk,nlk->nil", turned, self._inverse_tensor, turned)
         return np.where(self.is_free[:, None, None], inverse, 0.0)
 
-    def _moving(self) -> Moving:
+    def moving(self) -> Moving:
         """The bodies as kernels take them, which change these very arrays."""
         for name in ("position", "orientation", "velocity", "angular_velocity"):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)))
@@ -126,7 +126,7 @@ class MovingBodies:
 
     def describe(self, is_active: NDArray[np.bool_], pose: Array, ease: Array) -> None:
         """Note where bodies are and how easily impulses move active ones; see `state_kernels.describe`."""
-        describe(self._moving(), (self.is_free & is_active).astype(np.int32), pose, ease)
+        describe(self.moving(), (self.is_free & is_active).astype(np.int32), pose, ease)
 
     def fly_on(
         self,
@@ -140,7 +140,7 @@ class MovingBodies:
     ) -> None:
         """Move and turn active bodies for dt [s]; see `state_kernels.fly_on`."""
         which = (each.astype(np.int32) for each in (is_active, is_touched, is_held))
-        fly_on(self._moving(), dt, 0.5 * dt * gravity[None], extra, *which)
+        fly_on(self.moving(), dt, 0.5 * dt * gravity[None], extra, *which)
 
     def angular_momentum(self) -> Array:
         """Spin I omega about the centres of mass in world axes [kg m²/s], (n, 3); means nothing if kinematic."""

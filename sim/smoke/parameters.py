@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -15,6 +14,7 @@ from sim.core.motion.parameters import (
     RampPointParameters,
     placed_at_first_keyframe,
     require_ascending_times,
+    strength_at,
 )
 from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
@@ -105,12 +105,8 @@ class SmokeSourceParameters(Placement):
 
     def largest_strength(self, begin_s: float, end_s: float) -> float:
         """Largest strength by the ramp within a span of time [s]: what emission in ever shorter steps comes to."""
-        if not self.ramp:
-            return 1.0
-        times = [point.time_s for point in self.ramp]
-        strengths = [point.strength for point in self.ramp]
-        inner = [strength for time, strength in zip(times, strengths, strict=True) if begin_s < time < end_s]
-        return max(_interpolated(begin_s, times, strengths), _interpolated(end_s, times, strengths), *inner)
+        inner = [point.strength for point in self.ramp if begin_s < point.time_s < end_s]
+        return max(strength_at(self.ramp, begin_s), strength_at(self.ramp, end_s), *inner)
 
 
 class TurbulenceParameters(Parameters):
@@ -236,13 +232,3 @@ def boxes_overlap(a: tuple[Vector3, Vector3], b: tuple[Vector3, Vector3]) -> boo
     """Whether two boxes, given by their corners [m], have a volume in common."""
     (a_low, a_high), (b_low, b_high) = a, b
     return all(max(p, q) < min(r, s) for p, q, r, s in zip(a_low, b_low, a_high, b_high, strict=True))
-
-
-def _interpolated(time_s: float, times: list[float], values: list[float]) -> float:
-    """A piecewise linear function, constant beyond its ends."""
-    if time_s <= times[0]:
-        return values[0]
-    for (begin, end), (first, last) in zip(pairwise(times), pairwise(values), strict=True):
-        if time_s < end:
-            return first + (last - first) * (time_s - begin) / (end - begin)
-    return values[-1]

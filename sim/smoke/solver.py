@@ -78,6 +78,7 @@ class SmokeSolver:
         gravity: Vector3,
         solids: Sequence[HasSignedDistance] = (),
         moving: bool = False,
+        forces: ForceField | None = None,
     ) -> None:
         """Take a smoke, which may have the domain for its box, static solids, and room for obstacles that move."""
         self.name = parameters.name
@@ -110,7 +111,10 @@ class SmokeSolver:
         self._turbulence: Turbulence | None = None
         if parameters.turbulence.strength > 0.0:
             self._turbulence = Turbulence(self.grid, parameters.turbulence, parameters.wind)
+        outer = (forces or ForceField(())).on([(self.name,)])
         self.air_forces: list[AirForce] = []
+        if outer.accelerates or outer.blows:
+            self.air_forces.append(OuterForces(outer, self.air, parameters, self.grid))
         self._emitted_mass = 0.0
         self.begin_frame(0.0)
         if any(parameters.wind):
@@ -126,12 +130,6 @@ class SmokeSolver:
         """The state by the names of a checkpoint."""
         names = ("u_face_x", "v_face_y", "w_face_z", "density", "excess_temperature")
         return dict(zip(names, (*self.state.velocity, self.state.density, self.state.excess), strict=True))
-
-    def feel(self, forces: ForceField) -> None:
-        """Let forces from outside act on the air from now on, as far as they are meant for it."""
-        own = forces.on([(self.name,)])
-        if own.accelerates or own.blows:
-            self.air_forces.append(OuterForces(own, self.air, self.parameters, self.grid))
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no air crosses more than `cfl` cells, and no obstacle more than one.

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from sim.core.parameters import Fraction, NonNegative, Parameters, Vector3
@@ -69,3 +70,10 @@ def require_ascending_times(
                 f"{key}[{number}].time_s must be after {before.time_s:g} s, that of the {noun} before, "
                 f"got {after.time_s:g} s"
             )
+
+
+def strength_at(ramp: Sequence[RampPointParameters], time_s: float) -> float:
+    """Strength by a ramp at a time [s]: linear between its points, constant beyond them, 1 without any."""
+    if not ramp:
+        return 1.0
+    return float(np.interp(time_s, [point.time_s for point in ramp], [point.strength for point in ramp]))
