@@ -62,12 +62,12 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _breaks_in_dry_air(self) -> Self:
-        other = "fluid" if self.fluid else "cloth" if self.cloth else None
+        other = "fluid" if self.fluid else "cloth" if self.cloth else "forces" if self.force else None
         for body in self.rigid:
             if body.whole is not None and other is not None:
                 raise KeyRefusedError(
                     ("rigid", body.table, "breaks"),
-                    f"is of a body in a job with {other}, which pushes pieces one by one; remove one of both",
+                    f"is of a body in a job with {other}, which would push pieces one by one; remove one of both",
                 )
         return self
 
@@ -78,11 +78,6 @@ class SceneParameters(Parameters):
         for number, entry, name in unknown_targets(self.force, names):
             raise KeyRefusedError(
                 ("force", number, "only", entry), f'"{name}" is the name of no body, group, fluid, cloth or smoke'
-            )
-        broken = [body for body in self.rigid if body.whole is not None]
-        if self.force and broken:
-            raise KeyRefusedError(
-                ("rigid", broken[0].table, "breaks"), "is of a body in a job with forces; remove one of both"
             )
         return self
 
