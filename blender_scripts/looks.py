@@ -270,6 +270,47 @@ def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(builder.mix_shaders(fresnel.outputs[0], through, mirror))
 
 
+@draws("sand")
+def _sand(builder: NodeBuilder, context: LookContext) -> None:
+    """Grains of quartz and feldspar: each of a shade of its own, a few of them dark, and dull."""
+    red, green, blue = or_default(context.color, (0.56, 0.40, 0.24))
+    number = builder.node("ShaderNodePointInfo").outputs["Random"]
+    dark = (0.35 * red, 0.35 * green, 0.35 * blue)
+    light = (min(1.0, 1.3 * red), min(1.0, 1.3 * green), min(1.0, 1.35 * blue))
+    color = builder.ramp(number, (0.04, dark), (0.15, (0.8 * red, 0.8 * green, 0.8 * blue)), (0.95, light))
+    _even(builder, context, color=color, roughness=0.75, Specular_IOR_Level=0.3)
+
+
+@draws("snow")
+def _snow(builder: NodeBuilder, context: LookContext) -> None:
+    """Grains of ice that scatter light many times, a trace bluer the deeper it went; some are turned to the sun."""
+    number = builder.node("ShaderNodePointInfo").outputs["Random"]
+    glint = builder.math("GREATER_THAN", number, 0.97)
+    _even(
+        builder,
+        context,
+        color=(0.93, 0.95, 0.98),
+        roughness=builder.math("SUBTRACT", 0.6, builder.math("MULTIPLY", glint, 0.5)),
+        Subsurface_Weight=0.4,
+        Subsurface_Scale=0.01,
+    )
+
+
+@draws("jelly")
+def _jelly(builder: NodeBuilder, context: LookContext) -> None:
+    """Gelatine with fruit: light goes in, is scattered and comes out coloured, under a wet skin."""
+    _even(
+        builder,
+        context,
+        color=(0.75, 0.04, 0.05),
+        roughness=0.08,
+        Subsurface_Weight=0.6,
+        Subsurface_Scale=0.02,
+        Transmission_Weight=0.45,
+        IOR=1.35,
+    )
+
+
 @draws("tank_glass")
 def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     """Thin glass: reflects as glass does, and lets everything else straight through, so that it costs no bounces."""

@@ -22,6 +22,7 @@ from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
+from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.emitter import Carrier
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
@@ -40,6 +41,8 @@ from sim.rigid.states import StaticBody
 from sim.shapes.placement import SharedShapes, build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.smoke.solver import SmokeSolver
+from sim.soft.solver import SOLVER_NAME as SOFT_NAME
+from sim.soft.solver import SoftSolver
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -85,7 +88,8 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
     fluids = [_build_fluids(scene, static, rigid, samples, forces)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, static, forces) for smoke in scene.smoke]
-    coupled: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
+    softs = [_build_soft(scene, static, forces)] if scene.soft else []
+    coupled: list[Solver] = [*fluids, *cloths, *softs, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
         names = [body.name for kind in (True, False) for body in scene.rigid if (body.kind != "static") == kind]
@@ -96,6 +100,10 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         if rigid is not None and nodes is not None:
             couplings.append(ClothJointsCoupling(cloth, rigid, nodes, passing))
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
+    for soft in softs:
+        soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static)
+        if rigid is not None and soft.contacts is not None:
+            couplings.append(SoftRigidCoupling(soft, rigid, soft.contacts))
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
     standing = {body.name: body.snapshot() for body in static}
     return World(
@@ -110,12 +118,14 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
 def _refuse_names(scene: SceneParameters) -> None:
     """Refuse fluids and smokes with the name of a solver for many bodies."""
     names = {body.name for body in (*scene.fluid, *scene.smoke)}
-    if RIGID_NAME in names and any(body.kind != "static" for body in scene.rigid):
-        raise ValueError(
-            f'"{RIGID_NAME}" is what all moving bodies are called together; name the fluid or smoke otherwise'
-        )
-    if CLOTH_NAME in names and scene.cloth:
-        raise ValueError(f'"{CLOTH_NAME}" is what all cloths are called together; name the fluid or smoke otherwise')
+    moves = any(body.kind != "static" for body in scene.rigid)
+    for name, there, what in (
+        (RIGID_NAME, moves, "moving bodies"),
+        (CLOTH_NAME, bool(scene.cloth), "cloths"),
+        (SOFT_NAME, bool(scene.soft), "soft bodies"),
+    ):
+        if name in names and there:
+            raise ValueError(f'"{name}" is what all {what} are called together; name the fluid or smoke otherwise')
 
 
 def _build_fluids(
@@ -223,9 +233,22 @@ def _build_rigid(scene: SceneParameters, points: JointPoints | None, forces: For
         gravity=scene.gravity,
         forces=forces,
     )
-    solver.has_own_steps = not scene.fluid and not scene.cloth
+    solver.has_own_steps = not (scene.fluid or scene.cloth or scene.soft)
     check_start(solver)
     return solver
+
+
+def _build_soft(scene: SceneParameters, static: Sequence[StaticBody], forces: ForceField | None) -> SoftSolver:
+    """One solver for all soft bodies, clear of rigid ones."""
+    shapes = SharedShapes()
+    movers = [build_solid(body, shapes) for body in scene.rigid if body.kind != "static"]
+    return SoftSolver(
+        scene.soft,
+        domain=scene.domain,
+        gravity=scene.gravity,
+        solids=[*(body.solid for body in static), *movers],
+        forces=forces,
+    )
 
 
 def _build_smoke(

@@ -15,6 +15,7 @@ from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
+from sim.soft.parameters import SoftParameters
 
 
 class SceneParameters(Parameters):
@@ -35,6 +36,9 @@ class SceneParameters(Parameters):
     cloth: tuple[ClothParameters, ...] = Field(
         default=(), description="Cloths; they collide with each other, and share the keys that say how they step."
     )
+    soft: tuple[SoftParameters, ...] = Field(
+        default=(), description="Sand, snow, jelly and clay; they share a grid, and meet walls and rigid bodies."
+    )
     force: Annotated[tuple[Force, ...], Field(max_length=MOST_FORCES)] = Field(
         default=(), description="Forces from outside, and moving air, that act on all bodies, or on some."
     )
@@ -46,7 +50,11 @@ class SceneParameters(Parameters):
     @property
     def chosen_device(self) -> Device:
         """The device; of rigid bodies alone the CPU instead of the fastest one, as a GPU takes longer for them."""
-        return "cpu" if self.device == "auto" and not (self.fluid or self.cloth or self.smoke) else self.device
+        return (
+            "cpu"
+            if self.device == "auto" and not (self.fluid or self.cloth or self.smoke or self.soft)
+            else self.device
+        )
 
     @model_validator(mode="before")
     @classmethod
@@ -62,7 +70,8 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _breaks_in_dry_air(self) -> Self:
-        other = "fluid" if self.fluid else "cloth" if self.cloth else "forces" if self.force else None
+        others = {"fluid": self.fluid, "cloth": self.cloth, "soft matter": self.soft, "forces": self.force}
+        other = next((name for name, there in others.items() if there), None)
         for body in self.rigid:
             if body.whole is not None and other is not None:
                 raise KeyRefusedError(
@@ -72,12 +81,23 @@ class SceneParameters(Parameters):
         return self
 
     @model_validator(mode="after")
+    def _has_soft_matter_among_bodies(self) -> Self:
+        """Soft matter passes what no coupling of its own knows, which would be seen."""
+        for name, there in (("fluid", self.fluid), ("cloth", self.cloth), ("smoke", self.smoke)):
+            if self.soft and there:
+                raise KeyRefusedError(
+                    ("soft", 0), f"meets walls and rigid bodies, and would pass through {name}; remove one of both"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _has_forces_on_bodies(self) -> Self:
-        names = [body.name for body in (*self.fluid, *self.smoke, *self.cloth, *self.rigid)]
+        names = [body.name for body in (*self.fluid, *self.smoke, *self.cloth, *self.soft, *self.rigid)]
         names += [body.group for body in self.rigid]
         for number, entry, name in unknown_targets(self.force, names):
             raise KeyRefusedError(
-                ("force", number, "only", entry), f'"{name}" is the name of no body, group, fluid, cloth or smoke'
+                ("force", number, "only", entry),
+                f'"{name}" is the name of no body, group, fluid, cloth, smoke or soft body',
             )
         return self
 

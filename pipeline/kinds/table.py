@@ -23,6 +23,7 @@ from pipeline.kinds.cloth import CLOTH
 from pipeline.kinds.fluid import FLUID
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.smoke import SMOKE
+from pipeline.kinds.soft import SOFT
 from pipeline.model.boxes import domain_box
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, POINTS, SOLID, WHITEWATER
@@ -43,7 +44,7 @@ from sim.shapes.parameters import Placement
 if TYPE_CHECKING:
     from sim.core.world import World
 
-KINDS: dict[str, Kind] = {kind.name: kind for kind in (RIGID, FLUID, CLOTH, SMOKE)}
+KINDS: dict[str, Kind] = {kind.name: kind for kind in (RIGID, FLUID, CLOTH, SOFT, SMOKE)}
 """Every kind by its name, in the order in which a job's bodies are listed."""
 
 

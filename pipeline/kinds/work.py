@@ -37,8 +37,9 @@ GPU_RATES = {
     "viscous": GpuRates(60e-9, 7.0e-3),
     "cloth": GpuRates(80e-9, 2.4e-3),
     "smoke": GpuRates(1.2e-9, 2.5e-3),
+    "soft": GpuRates(1.0e-9, 0.5e-3),
 }
-"""Of fluids by solver, of solving for viscosity on top, of cloth and smoke."""
+"""Of fluids by solver, of solving for viscosity on top, of cloth, smoke and soft matter."""
 PARTICLE_FRAME_S, CELL_FRAME_S = 0.13e-6, 0.063e-6
 """Time of the host that a particle or a cell takes on its way from a GPU to the disk, in each frame [s]."""
 CELL_STEP_S = 0.25e-6
@@ -49,6 +50,8 @@ RISING_SHARE = 0.7
 """Largest speed of buoyant smoke over that of a free rise through its box."""
 PASSING_FACTOR = 2.0
 """Largest speed of air over that of the wind, or of a body that it has to get round."""
+SOFT_PARTICLE_STEP_S, SOFT_STEP_S = 0.7e-6, 0.5e-3
+"""Core time of a particle of soft matter in a step, and of launches [s]."""
 BODY_STEP_S = 0.3e-3
 """Time of a rigid body in a step: contacts are the host's [s]."""
 SURFACE_PARTICLE_S = 1.0e-3
@@ -171,6 +174,8 @@ def shared_steps(job: Job) -> float:
         steps = max(steps, CLOTH_REFINEMENT * substeps_of(job.cloth))
     if job.fluid:
         steps = max(steps, steps_a_frame(job))
+    if job.soft:
+        steps = max(steps, 1.0 / (job.fps * min(soft.longest_step for soft in job.soft)))
     return steps
 
 
@@ -213,6 +218,15 @@ def smoke_work(job: Job, cells: float, on_gpu: bool) -> Work:
     rates = GPU_RATES["smoke"]
     host_s = steps * len(job.smoke) * rates.step_s + cells * CELL_FRAME_S
     return _on_reference(steps * cells * rates.element_s, host_s, on_gpu=True)
+
+
+def soft_work(job: Job, particles: float, on_gpu: bool) -> Work:
+    """Of a frame of all soft matter, of this many particles."""
+    steps = shared_steps(job)
+    if not on_gpu:
+        return _on_reference(steps * particles * SOFT_PARTICLE_STEP_S, steps * SOFT_STEP_S)
+    rates = GPU_RATES["soft"]
+    return _on_reference(steps * particles * rates.element_s, steps * rates.step_s, on_gpu=True)
 
 
 def _smoke_steps(job: Job, index: int) -> float:

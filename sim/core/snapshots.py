@@ -20,6 +20,8 @@ class Snapshot:
     - fluid: `position` (n, 3) [m], `velocity` (n, 3) [m/s], `density` (n,) [kg/m³], `pressure` (n,)
       [Pa], `particle_id` (n,) int32; `dye` (n,) [-] of a fluid that has some. Attributes: `particle_radius` [m],
       `rest_density` [kg/m³]. Rows are sorted by `particle_id`.
+    - soft: `position` (n, 3) [m], `velocity` (n, 3) [m/s], `particle_id` (n,) int32, ascending. Attributes: `radius`
+      half the spacing of particles at rest [m], `material`.
     - smoke: `density` (nx, ny, nz) [-], `temperature` (nx, ny, nz) [K], `velocity` (nx, ny, nz, 3) [m/s],
       all at cell centres. Attributes: `origin` (3,) lower corner of the grid [m], `cell_size` [m],
       `ambient_temperature` [K].

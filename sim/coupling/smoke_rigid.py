@@ -2,18 +2,15 @@
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 
-from sim.core.arrays import Matrices, Vectors
-from sim.core.bundles import bundle
-from sim.core.host_access import put
 from sim.core.launch import kernel
 from sim.core.motion.paths import ArcLength, Path
 from sim.core.solver import Coupling
-from sim.shapes.device_shapes import DeviceShapes, Shapes, distance_to, surface_motion
+from sim.shapes.moving_shapes import Bodies, MovingShapes, distance_of, velocity_at
 from sim.smoke.lanes import Grid, row_start
 from sim.smoke.obstacles import Marks, mark, time_of_travel
 
@@ -24,18 +21,6 @@ if TYPE_CHECKING:
 MARGIN = (
     1.5  # beyond a body's box in which corners are marked: those of all cells that it cuts, whatever rounding [cells]
 )
-
-
-@bundle
-class Bodies(NamedTuple):
-    """Moving bodies, (b,) each."""
-
-    shapes: Shapes
-    centre_of_mass: Vectors  # in the frame of the shape [m]
-    position: Vectors  # of the centre of mass [m]
-    rotation: Matrices
-    velocity: Vectors  # [m/s]
-    spin: Vectors  # [1/s]
 
 
 class SmokeRigidCoupling(Coupling):
@@ -61,11 +46,7 @@ class SmokeRigidCoupling(Coupling):
         """
         self.bodies = (rigid.name, smoke.name)
         self._rigid, self._smoke = rigid, smoke
-        shapes, count = DeviceShapes(rigid.solids), len(rigid.solids)
-        self._shapes = shapes
-        position, velocity, spin = (ti.Vector.ndarray(3, ti.f32, count) for _ in range(3))
-        rotation = ti.Matrix.ndarray(3, 3, ti.f32, count)
-        self._bodies = Bodies(shapes.on_device, shapes.centre_of_mass, position, rotation, velocity, spin)
+        self._shapes = MovingShapes(rigid.solids)
         self._ways: dict[int, tuple[Path, ArcLength]] = {}
         smoke.obstacles.movers.append(self)
 
@@ -104,14 +85,7 @@ class SmokeRigidCoupling(Coupling):
         """Mark the corners about the bodies at the end of a step of the smoke of dt [s]."""
         bodies, grid, obstacles = self._rigid.bodies, self._smoke.grid, self._smoke.obstacles
         turned = bodies.rotation()
-        self._shapes.deform(self._rigid.time_s, 1.0)
-        for array, values in (
-            (self._bodies.position, bodies.position),
-            (self._bodies.rotation, turned),
-            (self._bodies.velocity, bodies.velocity),
-            (self._bodies.spin, bodies.angular_velocity),
-        ):
-            put(array, values)
+        self._shapes.put(bodies.position, turned, bodies.velocity, bodies.angular_velocity, self._rigid.time_s)
         for number, geometry in enumerate(self._rigid.solids):
             half, middle = 0.5 * np.ptp(geometry.bounds, axis=0), geometry.bounds.mean(axis=0)
             centre, reach = bodies.position[number] + turned[number] @ middle, np.abs(turned[number]) @ half
@@ -122,7 +96,7 @@ class SmokeRigidCoupling(Coupling):
             high = [int(n) for n in np.clip(last, 0, np.add(grid.cells, 1))]
             if all(begin <= end for begin, end in zip(low, high, strict=True)):
                 window = ti.math.ivec3(low), ti.math.ivec3(high), ti.math.vec3(grid.origin), grid.cell_size
-                _mark_body(number, *window, obstacles.box, obstacles.marks, self._bodies)
+                _mark_body(number, *window, obstacles.box, obstacles.marks, self._shapes.bodies)
 
 
 @kernel
@@ -140,10 +114,5 @@ def _mark_body(
     for i, j in ti.ndrange((low[0], high[0] + 1), (low[1], high[1] + 1)):
         for k in range(low[2], high[2] + 1):
             corner = origin + cell_size * (ti.Vector([float(i), float(j), float(k)]) - 1.0)
-            arm = corner - bodies.position[body]
-            place = bodies.rotation[body].transpose() @ arm + bodies.centre_of_mass[body]
-            velocity = bodies.velocity[body] + bodies.spin[body].cross(arm)
-            if ti.static(bodies.shapes.deforms):
-                velocity += bodies.rotation[body] @ surface_motion(place, body, bodies.shapes)
-            distance = distance_to(place, body, bodies.shapes) / cell_size
-            mark(marks, row_start(box, i, j) + k, distance, velocity)
+            distance = distance_of(corner, body, bodies) / cell_size
+            mark(marks, row_start(box, i, j) + k, distance, velocity_at(corner, body, bodies))

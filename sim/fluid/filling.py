@@ -58,7 +58,7 @@ def fill_fluids(
         spacing = fluid.spacing
         for number, block in enumerate(fluid.block):
             solid = build_solid(block)
-            points = pack(solid, spacing, surroundings(domain, solids, filled), np.concatenate(positions))
+            points = pack(solid, spacing, Surroundings.in_domain(domain, solids, filled), np.concatenate(positions))
             filled.append(solid)
             if len(sheets) and len(points):
                 clearance = _sheet_clearance(fluid.support_in_spacings) * spacing
@@ -73,12 +73,6 @@ def fill_fluids(
             phase.append(np.full(len(points), index, dtype=np.int32))
             dye.append(np.full(len(points), block.dye, dtype=np.float32))
     return FluidFilling(*map(np.concatenate, (positions, velocities, phase, dye)))
-
-
-def surroundings(domain: DomainParameters, walls: Sequence[Solid], filled: Sequence[Solid]) -> Surroundings:
-    """What bounds a block: the domain, solid bodies, and the blocks that were filled before it."""
-    open_faces = [np.array([f"{axis}{side}" in domain.open_faces for axis in "xyz"]) for side in "-+"]
-    return Surroundings(np.array(domain.min), np.array(domain.max), walls, filled, *open_faces)
 
 
 def _sheet_clearance(support_in_spacings: float) -> float:

@@ -2,38 +2,16 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 
 from sim.core.arrays import Floats, Vectors
-from sim.core.bundles import bundle
-from sim.core.domain import DomainParameters
+from sim.core.box import Box
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced_tree
 
 MAXIMA, COUNTS = 4, 3
-
-UNLIMITED = 1.0e30  # coordinate that no particle reaches [m]
-
-
-@bundle
-class Box(NamedTuple):
-    """The box that holds the particles: closed faces stop them, open faces let them go."""
-
-    wall_low: ti.math.vec3  # corners of the closed faces [m]; out of reach where a face is open
-    wall_high: ti.math.vec3
-    keep_low: ti.math.vec3  # corners of the open faces [m]; out of reach where a face is closed
-    keep_high: ti.math.vec3
-
-
-def box_of(domain: DomainParameters) -> Box:
-    """The box of a domain."""
-    is_open = np.array([[f"{axis}{side}" in domain.open_faces for axis in "xyz"] for side in "-+"])
-    ends = np.array([domain.min, domain.max])
-    far = np.array([[-UNLIMITED], [UNLIMITED]])
-    return Box(*map(tuple, [*np.where(is_open, far, ends).tolist(), *np.where(is_open, ends, far).tolist()]))
 
 
 @dataclass(frozen=True)

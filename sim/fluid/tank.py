@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
+from sim.core.box import box_of
 from sim.core.cells import CellGrid
 from sim.core.neighbors import cells_per_radius
 from sim.fluid.body_forces import BodyForces
@@ -19,7 +20,7 @@ from sim.fluid.emitter import Carrier, Emission
 from sim.fluid.kernels import Discretization
 from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
 from sim.fluid.sheets import SheetForces
-from sim.fluid.stepping import MotionSummary, ParticleStepper, box_of
+from sim.fluid.stepping import MotionSummary, ParticleStepper
 from sim.forces.field import ForceField, ForcesOn
 
 if TYPE_CHECKING:

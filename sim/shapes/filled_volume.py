@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sim.core.domain import DomainParameters
 from sim.shapes.placement import PlacedSolid
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder
 from sim.shapes.sampling import fill_with_particles
@@ -53,6 +54,14 @@ class Surroundings:
         default_factory=lambda: np.zeros(3, dtype=bool)
     )  # domain faces without a wall
     open_upper: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(3, dtype=bool))
+
+    @classmethod
+    def in_domain(
+        cls, domain: DomainParameters, walls: Sequence[HasSignedDistance], filled: Sequence[HasSignedDistance]
+    ) -> Surroundings:
+        """What bounds a volume: the domain, solid bodies, and the volumes that were filled before it."""
+        open_faces = [np.array([f"{axis}{side}" in domain.open_faces for axis in "xyz"]) for side in "-+"]
+        return cls(np.array(domain.min), np.array(domain.max), walls, filled, *open_faces)
 
     def near(self, solid: PlacedSolid) -> Surroundings:
         """Those of them that reach a solid."""

@@ -13,9 +13,8 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, Problem
 from sim.core.domain import DomainParameters
-from sim.fluid.filling import surroundings
 from sim.fluid.parameters import FluidParameters
-from sim.shapes.filled_volume import amount
+from sim.shapes.filled_volume import Surroundings, amount
 
 BYTES_PER_PARTICLE, BYTES_PER_PARTICLE_ON_GPU = 1024, 600
 """Upper bounds of what the solvers take, neighbour search included, and on a CPU the snapshots."""
@@ -99,7 +98,7 @@ def _check_block(job: Job, path: KeyPath, solids: Solids, findings: Findings) ->
     walls = [each for place, each in solids.items() if place[0] == "rigid"]
     earlier = [each for place, each in solids.items() if place[0] == "fluid" and place < path]
     held, outside_walls = (
-        amount(solid, fluid.spacing, surroundings(job.domain, walls, others)) for others in (earlier, [])
+        amount(solid, fluid.spacing, Surroundings.in_domain(job.domain, walls, others)) for others in (earlier, [])
     )
     thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
     kept_out = round(held.of_solid) - outside_walls.particles

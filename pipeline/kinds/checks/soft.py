@@ -1,0 +1,79 @@
+"""Checks of soft matter: memory, blocks, and bodies that are too thin for its grid."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.kinds.base import Solids
+from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.model.amounts import rounded_up
+from pipeline.model.job import Job
+from pipeline.model.problems import Findings
+from sim.shapes.filled_volume import Surroundings, amount
+from sim.shapes.placement import PlacedSolid
+from sim.soft.parameters import SoftParameters, shared_conflicts
+
+BYTES_PER_PARTICLE = 560
+"""Of the solver with the nodes around a particle, and the snapshots and checkpoints that wait to be written."""
+FEWEST_CELLS = 3.0
+"""Cells across a body, or a block, below which it is told: fewer bend, and are met, in no way that means much."""
+SHORTEST_STEP_S = 2.0e-6
+
+
+def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
+    """Note what is wrong with soft bodies; returns their particles."""
+    for number, key, message in shared_conflicts(job.soft):
+        findings.error(("soft", number, key), message)
+    walls = [solid for path, solid in solids.items() if path[0] == "rigid"]
+    filled: list[PlacedSolid] = []
+    total = 0
+    for index, soft in enumerate(job.soft):
+        _check_steps(job, index, soft, findings)
+        for number in range(len(soft.block)):
+            path = ("soft", index, "block", number)
+            if (solid := solids.get(path)) is None:
+                continue
+            particles = amount(solid, soft.spacing, Surroundings.in_domain(job.domain, walls, filled)).particles
+            if particles == 0:
+                findings.error(
+                    path,
+                    "has no particle: it is outside the domain, inside solids, or filled by the blocks before it; move "
+                    "it, or use a smaller cell_size",
+                )
+            elif (thin := float(np.min(np.ptp(solid.bounds, axis=0)))) < FEWEST_CELLS * soft.cell_size:
+                findings.warn(
+                    path,
+                    f"is {thin:.3g} m thin, less than {FEWEST_CELLS:g} cells of {soft.cell_size:g} m, and will be too "
+                    f"stiff; use cell_size = {thin / FEWEST_CELLS:.2g} or less",
+                )
+            filled.append(solid)
+            total += particles
+    if refusal := budget.refusal(total, "particles of soft matter", BYTES_PER_PARTICLE):
+        findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
+    if job.soft:
+        _check_bodies(solids, job.soft[0].cell_size, findings)
+    return total
+
+
+def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings) -> None:
+    """Refuse what is so stiff that a frame would take no end of steps."""
+    step = soft.longest_step
+    if step < SHORTEST_STEP_S:
+        findings.error(
+            ("soft", index, "young_modulus"),
+            f"{soft.value('young_modulus'):.3g} Pa need steps of {step:.2g} s, "
+            f"{rounded_up(1.0 / (job.fps * step)):,.0f} a frame; "
+            f"{soft.value('young_modulus') * (step / SHORTEST_STEP_S) ** 2:.2g} Pa or less would do, or larger cells",
+        )
+
+
+def _check_bodies(solids: Solids, cell_size: float, findings: Findings) -> None:
+    """Warn of bodies that nodes of the grid could miss."""
+    for path, solid in solids.items():
+        thin = float(np.min(np.ptp(solid.bounds, axis=0)))
+        if path[0] == "rigid" and thin < FEWEST_CELLS * cell_size:
+            findings.warn(
+                path,
+                f"is {thin:.3g} m thin, less than {FEWEST_CELLS:g} cells of soft matter, {cell_size:g} m, which may "
+                f"pass through it; use soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or a thicker body",
+            )

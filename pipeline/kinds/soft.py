@@ -1,0 +1,151 @@
+"""Soft matter: grains as points, what holds together as a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.base.content import tool_version
+from pipeline.base.layout import JobLayout
+from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
+from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.sizes import box_of, measures_of
+from pipeline.kinds.work import soft_work
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+from render.bounds import Reach, reach_of_particles
+from render.grains import GRAINS_A_PARTICLE, grains_of
+from render.meshes import validate_ply, write_ply
+from render.parameters import MaterialParameters
+from render.point_clouds import validate_point_cloud, write_point_cloud
+from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
+from render.surface import reconstruct_surface
+from sim.core.snapshots import Snapshot
+from sim.shapes.parameters import Placement
+from sim.soft.materials import MATERIALS, Law
+from sim.soft.parameters import SoftParameters
+
+if TYPE_CHECKING:
+    import h5py
+
+LOOKS: dict[str, MaterialParameters] = {
+    "sand": MaterialParameters(look="sand"),
+    "wet_sand": MaterialParameters(look="sand", color=(0.32, 0.22, 0.13)),
+    "snow": MaterialParameters(look="snow"),
+    "jelly": MaterialParameters(look="jelly"),
+    "rubber": MaterialParameters(look="rubber"),
+    "clay": MaterialParameters(look="stone", color=(0.45, 0.24, 0.15)),
+    "dough": MaterialParameters(look="ceramic", color=(0.86, 0.76, 0.58), roughness=0.7),
+}
+"""Usual looks by material."""
+
+GRAINY = (Law.SAND, Law.SNOW)
+
+BASE_BYTES, BYTES_PER_PARTICLE = 150_000_000, 3_000
+"""Of a task that makes a file, with pysplashsurf."""
+
+
+def is_grainy(soft: SoftParameters) -> bool:
+    """Whether it is drawn grain by grain."""
+    return soft.row.law in GRAINY
+
+
+def count_particles(soft: SoftParameters) -> float:
+    """About the particles of a body: what its blocks hold. Raises as `measures_of`."""
+    return float(sum(measures_of(block).volume for block in soft.block) / soft.spacing**3)
+
+
+def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
+    for number, block in enumerate(job.soft[index].block):
+        yield ("block", number), block
+
+
+def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
+    from pipeline.kinds.checks.soft import check_soft
+
+    return check_soft(job, solids, budget, findings)
+
+
+def _coarser(job: Job, factor: float, _solids: SolidBuilder | None) -> list[Change]:
+    return [(("soft", index, "cell_size"), soft.cell_size * factor) for index, soft in enumerate(job.soft)]
+
+
+def _objects(_job: Job, _layout: JobLayout, soft: SoftParameters, material_of: Materials) -> Iterator[SceneObject]:
+    file, material = MATTER.file_of(soft.name), material_of(BODY)
+    if is_grainy(soft):
+        yield PointSequenceObject(name=soft.name, file=file, kind="spray", material=material)
+    else:
+        yield MeshSequenceObject(name=soft.name, file=file, material=material)
+
+
+def _reach(_job: Job, _layout: JobLayout, _soft: SoftParameters, group: h5py.Group) -> Reach | None:
+    position = group["position"][()]
+    return reach_of_particles(position, float(group.attrs["radius"])) if len(position) else None
+
+
+def _write(path: Path, soft: Snapshot, job: Job, threads: int) -> None:
+    arrays, radius = soft.arrays, soft.number("radius")
+    if MATERIALS[str(soft.attributes["material"])].law in GRAINY:
+        write_point_cloud(path, grains_of(arrays["position"], arrays["velocity"], arrays["particle_id"], radius=radius))
+        return
+    surface = reconstruct_surface(
+        arrays["position"], arrays["velocity"], particle_radius=radius, parameters=job.surface, threads=threads
+    )
+    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities)
+
+
+def _validate(path: Path) -> None:
+    """A mesh or a cloud, as its header says."""
+    with path.open("rb") as file:
+        is_mesh = b"element face" in file.read(1024)
+    (validate_ply if is_mesh else validate_point_cloud)(path)
+
+
+MATTER = Product(
+    stage="soft",
+    about="grains and surfaces of soft matter",
+    version=1,
+    folder="soft",
+    suffix=".ply",
+    tools=lambda _job: {name: tool_version(name) for name in ("pysplashsurf", "numpy")},
+    parameters=lambda job: {"surface": job.surface.model_dump(mode="json")},
+    memory_bytes=lambda _job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft)),
+    write=_write,
+    validate=_validate,
+    file_bytes=lambda particles: 33.0 * GRAINS_A_PARTICLE * particles,
+    work=lambda _job, particles: Work(0.0, 3.0e-6 * particles),
+)
+
+SOFT = Kind(
+    name="soft",
+    parameters=SoftParameters,
+    about="Sand, snow, jelly and clay; they share a grid, and meet walls and rigid bodies.",
+    size="about {:,} particles of soft matter",
+    elements=lambda _job, soft: count_particles(soft),
+    snapshot_bytes=(150.0, 24.0, 140.0),
+    work=soft_work,
+    solver_bytes=300.0,
+    compiling_s=12.0,
+    drawing=0.6,
+    wears="rigid",
+    material=lambda soft: {BODY: LOOKS[soft.material]},
+    look_size=lambda _job, soft: sum(measures_of(block).volume for block in soft.block) ** (1.0 / 3.0),
+    boxes=lambda _job, soft: map(box_of, soft.block),
+    placements=_placements,
+    check=_check,
+    coarser=_coarser,
+    lighter="a larger soft.cell_size",
+    shares_solver=lambda _soft: True,
+    product=MATTER,
+    objects=_objects,
+    reach=_reach,
+    reach_bytes=160.0,
+    display=Display("Soft matter", "points"),
+    facts=lambda soft, count: (
+        f"{soft.material.replace('_', ' ')}, cells of {soft.cell_size:g} m"
+        + ("" if count is None else f", {count:,.0f} particles")
+    ),
+)

@@ -1,0 +1,1 @@
+"""Soft matter: sand, snow, jelly and clay, by the material point method."""

@@ -1,0 +1,208 @@
+"""A sparse grid: blocks of nodes near particles, and the particles sorted by the cells of these blocks.
+
+Nodes lie on a lattice of edge h; block and node numbers run along x first. A particle's base is the lowest of the 27
+nodes that a quadratic spline gives it a share in, floor(x/h - 1/2), and its cell is that of its base. Blocks that hold
+no node of any particle are neither stored nor computed; of the others there is a number for every 64 nodes of the
+domain. Blocks are numbered, and particles of a cell sorted, in an order that no thread decides.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import taichi as ti
+
+from sim.core.arrays import Integers, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.domain import DomainParameters
+from sim.core.launch import kernel
+from sim.core.scan import scan_in_parallel, scan_scratch_length
+
+EDGE = 4  # nodes along the edge of a block
+NODES = EDGE**3
+SUPPORT = 3  # nodes along an axis that a particle has a share in
+RING = 3  # nodes around the domain: what particles at its faces reach, and one
+GROWTH = 1.3
+MOST_BLOCKS = 2**28
+
+Triple = ti.types.vector(3, ti.i32)
+
+
+@bundle
+class Blocks(NamedTuple):
+    """The blocks, and the particles sorted by cell; of `k` blocks that there is room for."""
+
+    origin: ti.math.vec3  # of the lattice [m]
+    edge: ti.f32  # h [m]
+    shape: Triple  # blocks along each axis
+    mark: Integers  # of each block of the lattice: whether it holds bases, then its number, (blocks,)
+    number: Integers  # of each block of the lattice, -1 where it is not stored, (blocks + 1,)
+    place: Integers  # of each stored block in the lattice, (k,)
+    first: Integers  # first sorted particle of each cell, (k * NODES + 1,)
+    cursor: Integers  # of the sort, (k * NODES,)
+    scratch: Integers
+    cell: Integers  # of each particle, or -1 outside, (n,)
+    order: Integers  # particles by cell, (n,)
+    room: ti.i32  # k
+
+
+class BlockGrid:
+    """The sparse grid of some particles in a domain.
+
+    Attributes:
+        blocks: for kernels; another one when it had to grow.
+        count: blocks that are stored.
+
+    Args:
+        particles: how many.
+    """
+
+    def __init__(self, domain: DomainParameters, edge: float, particles: int) -> None:
+        low, high = np.array(domain.min), np.array(domain.max)
+        nodes = np.ceil((high - low) / edge - 1.0e-6) + 1.0 + 2.0 * RING
+        shape = np.ceil(nodes / EDGE) + 1.0
+        if shape.prod() > MOST_BLOCKS:
+            raise ValueError(
+                f"a domain of {' x '.join(f'{length:g}' for length in high - low)} m has {shape.prod():.3g} blocks of "
+                f"{EDGE * edge:g} m, more than {MOST_BLOCKS}; give a smaller domain or a larger cell_size"
+            )
+        total = math.prod(shape.astype(int).tolist())
+        self._domain, self._n, self.count = domain, particles, 0
+        self._lattice = {
+            "origin": tuple((low - RING * edge).tolist()),
+            "edge": edge,
+            "shape": tuple(shape.astype(int).tolist()),
+            "mark": ti.ndarray(ti.i32, total),
+            "number": ti.ndarray(ti.i32, total + 1),
+            "cell": ti.ndarray(ti.i32, max(particles, 1)),
+            "order": ti.ndarray(ti.i32, max(particles, 1)),
+        }
+        self._total = total
+        self._make_room(64)
+
+    def sort(self, position: ti.Ndarray, body: ti.Ndarray) -> bool:
+        """Find the blocks of the particles and sort them; returns whether there is room for more blocks than before.
+
+        Particles of body -1 are left out.
+        """
+        grown = False
+        self.count = find_blocks(self.blocks, position, body, self._n)
+        while self.count > self.blocks.room:
+            self._make_room(int(GROWTH * self.count))
+            grown = True
+            self.count = find_blocks(self.blocks, position, body, self._n)
+        sort_by_cell(self.blocks, self.count, self._n)
+        return grown
+
+    def _make_room(self, room: int) -> None:
+        cells = room * NODES
+        self.blocks = Blocks(
+            **self._lattice,
+            place=ti.ndarray(ti.i32, room),
+            first=ti.ndarray(ti.i32, cells + 1),
+            cursor=ti.ndarray(ti.i32, cells),
+            scratch=ti.ndarray(ti.i32, scan_scratch_length(max(cells, self._total))),
+            room=room,
+        )
+
+
+@func
+def base_of(x: ti.math.vec3, blocks: Blocks) -> Triple:
+    """Lowest node of a particle at x [m]."""
+    return ti.cast(ti.floor((x - blocks.origin) / blocks.edge - 0.5), ti.i32)
+
+
+@func
+def block_of(node: Triple, blocks: Blocks) -> ti.i32:
+    """Place in the lattice of a node's block."""
+    return ((node[2] >> 2) * blocks.shape[1] + (node[1] >> 2)) * blocks.shape[0] + (node[0] >> 2)
+
+
+@ti.func
+def within_block(node: Triple) -> ti.i32:
+    """Number of a node in its block."""
+    return ((node[2] & 3) * EDGE + (node[1] & 3)) * EDGE + (node[0] & 3)
+
+
+@func
+def node_at(node: Triple, blocks: Blocks) -> ti.i32:
+    """Number of a stored node."""
+    return blocks.number[block_of(node, blocks)] * NODES + within_block(node)
+
+
+@func
+def node_of(number: ti.i32, blocks: Blocks) -> Triple:
+    """The node of a number."""
+    place = blocks.place[number // NODES]
+    inside = number % NODES
+    x = place % blocks.shape[0]
+    y = place // blocks.shape[0] % blocks.shape[1]
+    z = place // (blocks.shape[0] * blocks.shape[1])
+    return Triple(EDGE * x + inside % EDGE, EDGE * y + inside // EDGE % EDGE, EDGE * z + inside // (EDGE * EDGE))
+
+
+@func
+def place_of_node(number: ti.i32, blocks: Blocks) -> ti.math.vec3:
+    """Where a stored node is [m]."""
+    return blocks.origin + blocks.edge * ti.cast(node_of(number, blocks), ti.f32)
+
+
+@kernel
+def find_blocks(blocks: Blocks, position: Vectors, body: Integers, count: ti.i32) -> ti.i32:
+    """Number the blocks that hold nodes of particles; returns how many there are, which may be more than have room."""
+    total = blocks.mark.shape[0]
+    for m in range(total):
+        blocks.mark[m] = 0
+    for p in range(count):
+        if body[p] >= 0:
+            blocks.mark[block_of(base_of(position[p], blocks), blocks)] = 1
+    for m in range(total):
+        x, y, z = m % blocks.shape[0], m // blocks.shape[0] % blocks.shape[1], m // (blocks.shape[0] * blocks.shape[1])
+        reached = 0
+        for d in ti.static(range(8)):
+            dx, dy, dz = ti.static(d % 2, d // 2 % 2, d // 4)
+            if x >= dx and y >= dy and z >= dz:
+                reached |= blocks.mark[m - (dz * blocks.shape[1] + dy) * blocks.shape[0] - dx]
+        blocks.number[m] = reached
+    for m in range(total):
+        blocks.mark[m] = blocks.number[m]
+    found = scan_in_parallel(blocks.mark, total, blocks.scratch, blocks.number)
+    for m in range(total):
+        if blocks.mark[m] == 0:
+            blocks.number[m] = -1
+        elif blocks.number[m] < blocks.room:
+            blocks.place[blocks.number[m]] = m
+    for p in range(count):
+        cell = -1
+        if body[p] >= 0:
+            cell = node_at(base_of(position[p], blocks), blocks)
+        blocks.cell[p] = cell
+    return found
+
+
+@kernel
+def sort_by_cell(blocks: Blocks, stored: ti.i32, count: ti.i32):
+    """Counting sort; particles of a cell by number. Threads race for the places in a cell, a sort by insertion settles
+    it."""
+    cells = stored * NODES
+    for c in range(cells):
+        blocks.cursor[c] = 0
+    for p in range(count):
+        if blocks.cell[p] >= 0:
+            ti.atomic_add(blocks.cursor[blocks.cell[p]], 1)
+    scan_in_parallel(blocks.cursor, cells, blocks.scratch, blocks.first)
+    for c in range(cells):
+        blocks.cursor[c] = blocks.first[c]
+    for p in range(count):
+        if blocks.cell[p] >= 0:
+            slot = ti.atomic_add(blocks.cursor[blocks.cell[p]], 1)
+            blocks.order[slot] = p
+    for c in range(cells):
+        first = blocks.first[c]
+        for k in range(first + 1, blocks.first[c + 1]):
+            particle = blocks.order[k]
+            slot = k
+            while slot > first and blocks.order[slot - 1] > particle:
+                blocks.order[slot] = blocks.order[slot - 1]
+                slot -= 1
+            blocks.order[slot] = particle

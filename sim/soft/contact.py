@@ -1,0 +1,272 @@
+"""Nodes of the grid against walls and bodies: no node moves into them, and friction slows what slides along.
+
+Of a body that is free to move, nodes inside and it collide without bounce, all at once. With P = n n' + t (1 - n n'), t
+the share of the sliding that friction ends, and the body's motion at a node J u = u_v + u_w x r,
+
+    (M + sum m J'P J) u = sum m J'P (v - v_body)
+
+over the nodes that come nearer gives the change u of the body's motion that all of them together make. Nodes then meet
+the body as it moves afterwards: however light it is, it is not thrown back and forth. What they lose the body gets.
+
+Sums over nodes are of integers, so that they are the same in any order.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.core.arrays import Floats, Integers, LongIntegers, Vectors, on_device
+from sim.core.box import Box
+from sim.core.bundles import bundle, func
+from sim.core.host_access import put, take
+from sim.core.launch import kernel
+from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.moving_shapes import Bodies, MovingShapes, distance_of, normal_of, velocity_at
+from sim.soft.blocks import NODES, Blocks, place_of_node
+from sim.soft.transfers import Nodes
+
+Float64Array = NDArray[np.float64]
+
+PARTS = 64  # of each sum, so that few threads meet at a number
+QUANTA = 2.0**56  # of a sum, whose terms are over what they are at most together
+TERMS = 27  # of a body's sums: 6 of J'P (v - v_body), 21 of J'P J, its upper triangle
+UPPER = np.triu_indices(6)
+SLOW = 1.0e-12  # speed along a surface at which there is no direction of it [m/s]
+
+
+@bundle
+class Touching(NamedTuple):
+    """Bodies as nodes meet them, and the sums of what they do to each, (bodies,) but for sums."""
+
+    bodies: Bodies
+    count: ti.i32
+    radius: Floats  # of a sphere around the centre of mass that holds the body [m]
+    step: Floats  # half width of differences for normals [m]
+    friction: Floats  # [-]
+    is_free: Integers
+    gain: Vectors  # change of velocity in the collision [m/s]
+    turn: Vectors  # of spin [1/s]
+    sums: LongIntegers  # of the collision, (bodies * TERMS * PARTS,)
+    impulse: LongIntegers  # linear and angular, (bodies * 6 * PARTS,)
+    mass_unit: ti.f32  # [kg]
+    speed_unit: ti.f32  # [m/s]
+
+
+class BodyContacts:
+    """The bodies of a scene as soft matter meets them: those that move, then those that stand.
+
+    Args:
+        geometries: of all bodies, one at least.
+        moving: how many of them, the first ones, may move.
+        friction: of all bodies [-].
+        mass: of all soft matter [kg].
+    """
+
+    def __init__(self, geometries: Sequence[BodyGeometry], moving: int, friction: Sequence[float], mass: float) -> None:
+        self._geometries, self._moving, self._mass = tuple(geometries), moving, mass
+        self._shapes = MovingShapes(geometries)
+        count = len(geometries)
+        self._position, self._velocity, self._spin = (np.zeros((count, 3)) for _ in range(3))
+        self._rotation = np.tile(np.eye(3), (count, 1, 1))
+        self._inverse_mass, self._inverse_inertia = np.zeros(count), np.zeros((count, 3, 3))
+        arrays = [ti.Vector.ndarray(3, ti.f32, count) for _ in range(2)]
+        sums = [ti.ndarray(ti.i64, count * terms * PARTS) for terms in (TERMS, 6)]
+        shapes = self._shapes.shapes
+        self._touching = Touching(
+            self._shapes.bodies,
+            count,
+            shapes.radius,
+            shapes.step,
+            on_device(np.array(friction, np.float32)),
+            on_device(np.zeros(count, np.int32)),
+            *arrays,
+            *sums,
+            mass,
+            1.0,
+        )
+
+    def stand(self, position: Float64Array, rotation: Float64Array) -> None:
+        """Place the last bodies, which never move, (k, 3) and (k, 3, 3)."""
+        self._position[self._moving :], self._rotation[self._moving :] = position, rotation
+        self._shapes.put(self._position, self._rotation, self._velocity, self._spin, 0.0)
+
+    def move(
+        self,
+        position: Float64Array,
+        rotation: Float64Array,
+        velocity: Float64Array,
+        spin: Float64Array,
+        time_s: float,
+        mobility: tuple[Float64Array, Float64Array],
+    ) -> None:
+        """Place the bodies that move, as `MovingShapes.put`, with their inverse masses and inertias."""
+        for all_of, own in (
+            (self._position, position),
+            (self._rotation, rotation),
+            (self._velocity, velocity),
+            (self._spin, spin),
+            (self._inverse_mass, mobility[0]),
+            (self._inverse_inertia, mobility[1]),
+        ):
+            all_of[: self._moving] = own
+        self._shapes.put(self._position, self._rotation, self._velocity, self._spin, time_s)
+        put(self._touching.is_free, (self._inverse_mass > 0.0).astype(np.int32))
+
+    def resolve(self, blocks: Blocks, stored: int, nodes: Nodes, dt: float) -> None:
+        """Let the nodes of stored blocks and the bodies collide in a step of dt [s]."""
+        touching = self._touching = self._touching._replace(speed_unit=blocks.edge / dt)
+        if (self._inverse_mass > 0.0).any():
+            sum_collisions(blocks, stored, nodes, touching)
+            self._find_gains()
+        collide(blocks, stored, nodes, touching)
+
+    def _find_gains(self) -> None:
+        """Solve for what each body's motion gains."""
+        touching, unit = self._touching, self._mass / QUANTA
+        sums = take(touching.sums).astype(np.float64).reshape(-1, TERMS, PARTS).sum(axis=2) * unit
+        gains = np.zeros((len(sums), 6))
+        for number in np.flatnonzero(sums[:, :6].any(axis=1)):
+            matrix, inverse = np.zeros((6, 6)), np.zeros((6, 6))
+            matrix[UPPER] = sums[number, 6:]
+            matrix += np.triu(matrix, 1).T
+            inverse[:3, :3] = self._inverse_mass[number] * np.eye(3)
+            inverse[3:, 3:] = self._inverse_inertia[number]
+            # Angular parts are summed over a radius, as the device has them.
+            scale = np.repeat([1.0, self._geometries[number].radius], 3)
+            matrix *= scale[:, None] * scale
+            momentum = touching.speed_unit * scale * sums[number, :6]
+            gains[number] = np.linalg.solve(np.eye(6) + inverse @ matrix, inverse @ momentum)
+        put(touching.gain, gains[:, :3])
+        put(touching.turn, gains[:, 3:])
+
+    def take_impulses(self) -> tuple[Float64Array, Float64Array]:
+        """Linear [N s] and angular impulse [N m s] on each body since the last call, (b, 3) each."""
+        touching = self._touching
+        sums = take(touching.impulse).astype(np.float64).reshape(-1, 6, PARTS).sum(axis=2)
+        sums *= self._mass * touching.speed_unit / QUANTA
+        radius = np.array([geometry.radius for geometry in self._geometries]).reshape(-1, 1)
+        return sums[:, :3], radius * sums[:, 3:]
+
+
+@func
+def body_at(x: ti.math.vec3, touching: Touching) -> ti.i32:
+    """The body that a point is deepest in, or -1."""
+    body, least = -1, 0.0
+    for b in range(touching.count):
+        if (x - touching.bodies.position[b]).norm() < touching.radius[b]:
+            distance = distance_of(x, b, touching.bodies)
+            if distance < least:
+                body, least = b, distance
+    return body
+
+
+@ti.func
+def slid(velocity: ti.math.vec3, normal: ti.math.vec3, friction: ti.f32) -> ti.math.vec3:
+    """A velocity relative to a surface after friction and without what leads into it."""
+    into = velocity.dot(normal)
+    result = velocity
+    if into < 0.0:
+        along = velocity - into * normal
+        result = along * ti.max(0.0, 1.0 + friction * into / ti.max(along.norm(), SLOW))
+    return result
+
+
+@func
+def pair_friction(nodes: Nodes, n: ti.i32, body: ti.i32, touching: Touching) -> ti.f32:
+    """Friction of a node against a body [-]."""
+    return ti.sqrt(nodes.friction[n] * touching.friction[body])
+
+
+@func
+def add_parts(sums: LongIntegers, at: ti.i32, n: ti.i32, value: ti.f32):
+    """Add to a sum, in one of its parts."""
+    ti.atomic_add(sums[at * PARTS + n % PARTS], ti.cast(value * ti.static(QUANTA), ti.i64))
+
+
+@kernel
+def sum_collisions(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touching):
+    """J'P (v - v_body) and J'P J of the nodes that come nearer to bodies that are free to move.
+
+    Lengths over the radius of the body, masses over the unit, speeds over theirs.
+    """
+    for n in range(stored * NODES):
+        if nodes.mass[n] > 0.0:
+            x = place_of_node(n, blocks)
+            body = body_at(x, touching)
+            if body >= 0 and touching.is_free[body] == 1:
+                normal = normal_of(x, body, touching.step[body], touching.bodies)
+                velocity = nodes.velocity[n] - velocity_at(x, body, touching.bodies)
+                into = velocity.dot(normal)
+                if into < 0.0:
+                    along = velocity - into * normal
+                    friction = pair_friction(nodes, n, body, touching)
+                    kept = ti.min(1.0, -friction * into / ti.max(along.norm(), SLOW))
+                    mass = nodes.mass[n] / touching.mass_unit
+                    arm = (x - touching.bodies.position[body]) / touching.radius[body]
+                    stops = mass * (into * normal + kept * along) / touching.speed_unit
+                    turns = arm.cross(stops)
+                    for k in ti.static(range(3)):
+                        add_parts(touching.sums, body * TERMS + k, n, stops[k])
+                        add_parts(touching.sums, body * TERMS + 3 + k, n, turns[k])
+                    # Columns of P J, and J' of each.
+                    place = 6
+                    for row in ti.static(range(6)):
+                        motion = ti.math.vec3(0.0)
+                        if ti.static(row < 3):
+                            motion[ti.static(row % 3)] = 1.0
+                        else:
+                            axis = ti.math.vec3(0.0)
+                            axis[ti.static(row % 3)] = 1.0
+                            motion = axis.cross(arm)
+                        through = motion.dot(normal)
+                        held = mass * (through * normal + kept * (motion - through * normal))
+                        twist = arm.cross(held)
+                        for column in ti.static(range(row, 6)):
+                            value = ti.static(held if column < 3 else twist)[ti.static(column % 3)]
+                            add_parts(touching.sums, body * TERMS + place + ti.static(column - row), n, value)
+                        place += ti.static(6 - row)
+
+
+@kernel
+def collide(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touching):
+    """Let nodes in bodies move along with them or away; bodies that are free get what nodes lose."""
+    for n in range(stored * NODES):
+        if nodes.mass[n] > 0.0:
+            x = place_of_node(n, blocks)
+            body = body_at(x, touching)
+            if body >= 0:
+                arm = x - touching.bodies.position[body]
+                frame = velocity_at(x, body, touching.bodies) + touching.gain[body] + touching.turn[body].cross(arm)
+                normal = normal_of(x, body, touching.step[body], touching.bodies)
+                before = nodes.velocity[n]
+                after = frame + slid(before - frame, normal, pair_friction(nodes, n, body, touching))
+                nodes.velocity[n] = after
+                if touching.is_free[body] == 1:
+                    share = nodes.mass[n] / touching.mass_unit
+                    lost = share * (before - after) / touching.speed_unit
+                    turned = (arm / touching.radius[body]).cross(lost)
+                    for k in ti.static(range(3)):
+                        add_parts(touching.impulse, body * 6 + k, n, lost[k])
+                        add_parts(touching.impulse, body * 6 + 3 + k, n, turned[k])
+
+
+@kernel
+def stop_at_walls(blocks: Blocks, stored: ti.i32, nodes: Nodes, box: Box):
+    """Let nodes on and behind the closed faces of the domain move along them or away."""
+    slack = 1.0e-3 * blocks.edge
+    for n in range(stored * NODES):
+        if nodes.mass[n] > 0.0:
+            x = place_of_node(n, blocks)
+            velocity = nodes.velocity[n]
+            for axis in ti.static(range(3)):
+                normal = ti.math.vec3(0.0)
+                if x[axis] < box.wall_low[axis] + slack:
+                    normal[axis] = 1.0
+                elif x[axis] > box.wall_high[axis] - slack:
+                    normal[axis] = -1.0
+                if normal[axis] != 0.0:
+                    velocity = slid(velocity, normal, nodes.friction[n])
+            nodes.velocity[n] = velocity

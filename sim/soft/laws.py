@@ -1,0 +1,206 @@
+"""Stresses of soft matter, and how it yields.
+
+The elastic strain of a particle is kept as e = b - 1, b its elastic left Cauchy-Green tensor: in single precision small
+strains are lost in b itself. In principal directions, which plastic flow of isotropic materials keeps,
+
+    b_i = 1 + e_i,   Hencky strain h_i = ln(b_i)/2,   Kirchhoff stress tau = J sigma
+
+Sources: Simo & Hughes 1998 (return mappings), Klár et al. 2016 (sand), Stomakhin et al. 2013 (snow), Tampubolon et al.
+2017 (volume that sand gained while it was apart). The cone of sand goes through a slope that is about to slide, shear
+tan(phi) p, as in Jop et al. 2006; that of Klár et al. touches Mohr and Coulomb's in compression, and lets sand of 33
+degrees stand at 50 in plane strain.
+"""
+
+from typing import NamedTuple
+
+import taichi as ti
+
+from sim.core.arrays import Floats, Integers
+from sim.core.bundles import bundle, func
+from sim.soft.materials import Law
+
+Matrix = ti.math.mat3
+Vector = ti.math.vec3
+
+SWEEPS = 4  # of Jacobi's rotations, which converge quadratically: off-diagonals vanish in single precision
+SMALL = 0.3  # up to which series of log1p and expm1 are taken, whose next terms are below 1e-7
+MOST_HARDENED, LEAST_HARDENED = 3.0, -2.0
+"""Exponents of snow's hardening at most and at least, exp(3) = 20 times as stiff: steps get shorter with its root."""
+
+
+@bundle
+class Laws(NamedTuple):
+    """Materials of the soft bodies, (bodies,) each."""
+
+    law: Integers
+    mu: Floats  # Lamé's [Pa]
+    lam: Floats
+    slope: Floats  # SAND: of the cone, |s| over 3 p, sqrt(2)/3 tan(phi) [-]
+    tip: Floats  # SAND: Hencky strain of volume that cohesion bears [-]
+    yielding: Floats  # CLAY: norm of the deviatoric Hencky strain at which it yields [-]
+    least: Floats  # SNOW: least and largest stretch [-]
+    most: Floats
+    hardening: Floats  # SNOW [-]
+
+
+@ti.func
+def log1p(x: ti.f32) -> ti.f32:
+    """ln(1 + x), by the series of 2 artanh(x/(2 + x)) where x is small."""
+    s = x / (2.0 + x)
+    q = s * s
+    series = 2.0 * s * (1.0 + q * (1.0 / 3.0 + q * (0.2 + q * (1.0 / 7.0 + q / 9.0))))
+    return ti.select(ti.abs(x) < SMALL, series, ti.log(ti.max(1.0 + x, 1.0e-6)))
+
+
+@ti.func
+def expm1(x: ti.f32) -> ti.f32:
+    """exp(x) - 1, by its series where x is small."""
+    series = x * (1.0 + x / 2.0 * (1.0 + x / 3.0 * (1.0 + x / 4.0 * (1.0 + x / 5.0 * (1.0 + x / 6.0)))))
+    return ti.select(ti.abs(x) < SMALL, series, ti.exp(x) - 1.0)
+
+
+@ti.func
+def principal(symmetric: Matrix):
+    """Eigenvalues and eigenvectors (columns) of a symmetric matrix, by cyclic Jacobi rotations (Golub & Van Loan)."""
+    a = symmetric
+    axes = Matrix(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    for _ in range(SWEEPS):
+        for pair in ti.static(((0, 1, 2), (0, 2, 1), (1, 2, 0))):
+            p, q, r = ti.static(pair)
+            apq = a[p, q]
+            if ti.abs(apq) > 1.0e-12 * (ti.abs(a[p, p]) + ti.abs(a[q, q])):
+                theta = 0.5 * (a[q, q] - a[p, p]) / apq
+                t = ti.select(theta >= 0.0, 1.0, -1.0) / (ti.abs(theta) + ti.sqrt(theta * theta + 1.0))
+                c = 1.0 / ti.sqrt(t * t + 1.0)
+                s = t * c
+                arp, arq = a[r, p], a[r, q]
+                a[p, p] -= t * apq
+                a[q, q] += t * apq
+                a[p, q] = 0.0
+                a[q, p] = 0.0
+                a[r, p] = c * arp - s * arq
+                a[p, r] = a[r, p]
+                a[r, q] = s * arp + c * arq
+                a[q, r] = a[r, q]
+                for row in ti.static(range(3)):
+                    vp, vq = axes[row, p], axes[row, q]
+                    axes[row, p] = c * vp - s * vq
+                    axes[row, q] = s * vp + c * vq
+    return Vector(a[0, 0], a[1, 1], a[2, 2]), axes
+
+
+@ti.func
+def recomposed(axes: Matrix, values: Vector) -> Matrix:
+    """The symmetric matrix with these eigenvectors (columns) and eigenvalues."""
+    scaled = axes
+    for row in ti.static(range(3)):
+        for column in ti.static(range(3)):
+            scaled[row, column] = axes[row, column] * values[column]
+    return scaled @ axes.transpose()
+
+
+@ti.func
+def spherical(value: ti.f32) -> Matrix:
+    """A multiple of the identity."""
+    return Matrix(value, 0.0, 0.0, 0.0, value, 0.0, 0.0, 0.0, value)
+
+
+@ti.func
+def moved_strain(e: Matrix, change: Matrix) -> Matrix:
+    """b' - 1 of b' = (1 + D) b (1 + D)', where D is the displacement gradient of a step."""
+    carried = e + change @ e
+    return carried + change + change.transpose() + (carried + change) @ change.transpose()
+
+
+@func
+def neo_hookean(e: Matrix, mu: ti.f32, lam: ti.f32) -> Matrix:
+    """tau = mu (b - 1) + lambda ln J (Simo & Hughes 1998, 9.2)."""
+    trace = e.trace()
+    squares = (e @ e).trace()
+    volume = trace + 0.5 * (trace * trace - squares) + e.determinant()
+    return mu * e + spherical(0.5 * lam * log1p(volume))
+
+
+@func
+def yielded_sand(strain: Vector, b: ti.i32, gained: ti.f32, laws: Laws):
+    """Hencky strains on or within the Drucker-Prager cone, and the volume gained then, as a Hencky strain.
+
+    Apart, its strain goes to the tip of the cone and is remembered; it presses again only once it is that much denser.
+    """
+    mu, lam = laws.mu[b], laws.lam[b]
+    tip = laws.tip[b]
+    volume = strain.sum() + gained - tip
+    deviator = strain - strain.sum() / 3.0
+    norm = deviator.norm()
+    result = Vector(0.0)
+    left = 0.0
+    if volume >= 0.0:
+        result = Vector(tip / 3.0)
+        left = volume
+    else:
+        excess = norm + (3.0 * lam + 2.0 * mu) / (2.0 * mu) * volume * laws.slope[b]
+        result = Vector((volume + tip) / 3.0) + deviator
+        if excess > 0.0:
+            result -= excess / ti.max(norm, 1.0e-20) * deviator
+    return result, left
+
+
+@func
+def yielded_clay(strain: Vector, b: ti.i32, laws: Laws) -> Vector:
+    """Hencky strains within von Mises' cylinder (Simo & Hughes 1998, radial return)."""
+    mean = strain.sum() / 3.0
+    deviator = strain - mean
+    norm = deviator.norm()
+    return Vector(mean) + ti.min(1.0, laws.yielding[b] / ti.max(norm, 1.0e-20)) * deviator
+
+
+@func
+def stress_of_hencky(strain: Vector, mu: ti.f32, lam: ti.f32) -> Vector:
+    """Principal tau = 2 mu h + lambda tr h."""
+    return 2.0 * mu * strain + lam * strain.sum()
+
+
+@func
+def hardened(hardening: ti.f32, plastic: ti.f32) -> ti.f32:
+    """Factor on the moduli of snow whose plastic Hencky strain of volume is given (Stomakhin et al. 2013, 6)."""
+    return ti.exp(ti.math.clamp(hardening * -expm1(plastic), LEAST_HARDENED, MOST_HARDENED))
+
+
+@func
+def respond(trial: Matrix, b: ti.i32, history: ti.f32, laws: Laws):
+    """What becomes of a trial strain e in a material: the elastic strain e, the Kirchhoff stress [Pa], and the history.
+
+    The history is the Hencky strain of volume that sand gained while it was apart, or that snow lost for good.
+    """
+    law, mu, lam = laws.law[b], laws.mu[b], laws.lam[b]
+    e, stress, told = trial, Matrix(0.0), history
+    if law == ti.static(int(Law.ELASTIC)):
+        stress = neo_hookean(trial, mu, lam)
+    else:
+        values, axes = principal(trial)
+        strain = Vector(0.0)
+        for k in ti.static(range(3)):
+            strain[k] = 0.5 * log1p(values[k])
+        after = strain
+        if law == ti.static(int(Law.SAND)):
+            after, told = yielded_sand(strain, b, history, laws)
+        elif law == ti.static(int(Law.CLAY)):
+            after = yielded_clay(strain, b, laws)
+        else:
+            least, most = 0.5 * log1p(laws.least[b] ** 2 - 1.0), 0.5 * log1p(laws.most[b] ** 2 - 1.0)
+            after = ti.min(ti.max(strain, least), most)
+            told = history + (strain - after).sum()
+        tau = stress_of_hencky(after, mu, lam)
+        if law == ti.static(int(Law.SNOW)):
+            volume = after.sum()
+            j = expm1(volume)
+            factor = hardened(laws.hardening[b], told)
+            for k in ti.static(range(3)):
+                stretch = expm1(after[k])
+                tau[k] = factor * (2.0 * mu * stretch * (1.0 + stretch) + lam * j * (1.0 + j))
+        stress = recomposed(axes, tau)
+        if (after != strain).any():
+            for k in ti.static(range(3)):
+                values[k] = expm1(2.0 * after[k])
+            e = recomposed(axes, values)
+    return e, stress, told

@@ -1,0 +1,73 @@
+"""What soft matter can be made of: laws, and the parameters that materials have by themselves.
+
+Elastic laws are isotropic, of the left Cauchy-Green tensor; plastic ones yield in its principal directions
+(`sim.soft.laws`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Law(IntEnum):
+    """How a material answers to being strained."""
+
+    ELASTIC = 0  # neo-Hookean
+    SAND = 1  # Hencky strains, Drucker-Prager
+    SNOW = 2  # fixed corotated, breaks beyond critical stretches, hardens
+    CLAY = 3  # Hencky strains, von Mises
+
+
+@dataclass(frozen=True)
+class MaterialRow:
+    """A material by name: its law, and usual values of the parameters that a job may give instead."""
+
+    law: Law
+    density: float  # at rest [kg/m³]
+    young_modulus: float  # [Pa]
+    poisson_ratio: float  # [-]
+    friction_angle_deg: float | None = None  # SAND [degrees]
+    cohesion: float | None = None  # SAND: shear stress that it bears without pressure [Pa]
+    yield_stress: float | None = None  # CLAY [Pa]
+    critical_compression: float | None = None  # SNOW: shortening, and
+    critical_stretch: float | None = None  # SNOW: lengthening beyond which it breaks [-]
+    hardening: float | None = None  # SNOW [-]
+    about: str = ""
+
+
+MATERIALS: dict[str, MaterialRow] = {
+    "sand": MaterialRow(
+        Law.SAND, 1600.0, 1.0e6, 0.3, friction_angle_deg=33.0, cohesion=0.0, about="dry sand (Klár et al. 2016)"
+    ),
+    "wet_sand": MaterialRow(
+        *(Law.SAND, 1900.0, 1.0e6, 0.3),
+        friction_angle_deg=35.0,
+        cohesion=1500.0,
+        about="sand that keeps the shape of its bucket",
+    ),
+    "snow": MaterialRow(
+        *(Law.SNOW, 400.0, 1.4e5, 0.2),
+        critical_compression=2.5e-2,
+        critical_stretch=7.5e-3,
+        hardening=10.0,
+        about="dense snow (Stomakhin et al. 2013, table 2)",
+    ),
+    "jelly": MaterialRow(Law.ELASTIC, 1050.0, 1.0e4, 0.45, about="gelatine of 3 % by mass"),
+    "rubber": MaterialRow(Law.ELASTIC, 1100.0, 5.0e5, 0.45, about="soft foam of rubber"),
+    "clay": MaterialRow(Law.CLAY, 1700.0, 5.0e5, 0.4, yield_stress=5.0e3, about="potter's clay"),
+    "dough": MaterialRow(Law.CLAY, 1200.0, 2.0e4, 0.4, yield_stress=400.0, about="bread dough"),
+}
+"""The materials, by name. Elastic moduli of grains and clays are those of bulk, lowered as far as shapes bear: real
+sand of some 1e7 Pa needs a third of the step."""
+
+
+LAW_KEYS: dict[str, Law] = {
+    "friction_angle_deg": Law.SAND,
+    "cohesion": Law.SAND,
+    "yield_stress": Law.CLAY,
+    "critical_compression": Law.SNOW,
+    "critical_stretch": Law.SNOW,
+    "hardening": Law.SNOW,
+}
+"""The law that each key belongs to."""

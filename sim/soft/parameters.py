@@ -1,0 +1,130 @@
+"""Soft matter as a job file names it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
+from sim.shapes.parameters import Placement
+from sim.soft.materials import LAW_KEYS, MATERIALS, MaterialRow
+
+PARTICLES_PER_CELL_EDGE = 2
+"""Particles along the edge of a cell at rest: eight a cell, as quadratic splines need."""
+
+WAVE_NUMBER = 0.5
+"""Cells that a compression wave crosses in the largest stable step."""
+
+
+class SoftBlockParameters(Placement):
+    """A volume filled with soft matter at the start."""
+
+    velocity: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Initial velocity [m/s].")
+
+
+class SoftParameters(Parameters):
+    """A body of soft matter: what it is made of, how finely it is computed, and the volumes that it fills."""
+
+    name: BodyName = Field(description="Name of the body, unique in the job.")
+    material: Literal["sand", "wet_sand", "snow", "jelly", "rubber", "clay", "dough"] = Field(
+        description="What it is made of, which gives the keys below that are omitted: "
+        + "; ".join(f"{name}: {row.about}" for name, row in MATERIALS.items())
+        + "."
+    )
+    block: tuple[SoftBlockParameters, ...] = Field(min_length=1, description="Volumes filled at the start.")
+    cell_size: Positive = Field(
+        default=0.02, description="Edge of the grid's cells [m], with eight particles each; one for all soft bodies."
+    )
+    density: Positive | None = Field(default=None, description="Density at rest [kg/m³]; that of the material.")
+    young_modulus: Positive | None = Field(
+        default=None, description="Young's modulus [Pa]; steps get shorter with its root."
+    )
+    poisson_ratio: Annotated[float, Field(ge=0.0, le=0.49)] | None = Field(
+        default=None, description="Poisson's ratio [-]."
+    )
+    friction_angle_deg: Annotated[float, Field(ge=1.0, le=60.0)] | None = Field(
+        default=None, description="Angle of internal friction [degrees]; of sand."
+    )
+    cohesion: NonNegative | None = Field(
+        default=None, description="Shear stress that it bears without pressure, as wet sand does [Pa]; of sand."
+    )
+    yield_stress: Positive | None = Field(
+        default=None, description="Stress in tension from which on it flows (von Mises) [Pa]; of clay and dough."
+    )
+    critical_compression: Annotated[float, Field(gt=0.0, lt=0.5)] | None = Field(
+        default=None, description="Shortening from which on it is crushed [-]; of snow."
+    )
+    critical_stretch: Annotated[float, Field(gt=0.0, lt=0.5)] | None = Field(
+        default=None, description="Lengthening from which on it breaks [-]; of snow."
+    )
+    hardening: NonNegative | None = Field(
+        default=None, description="Exponent by which it gets harder where it is crushed [-]; of snow."
+    )
+    friction: NonNegative = Field(
+        default=0.5,
+        description="Friction against walls and bodies [-]; with a body that of the pair is the root of the product.",
+    )
+    cfl: Positive = Field(default=1.0, le=1.5, description="Factor on the largest stable step [-].")
+
+    @model_validator(mode="after")
+    def _has_keys_of_its_law(self) -> Self:
+        for key, law in LAW_KEYS.items():
+            if key in self.model_fields_set and law != self.row.law:
+                names = " or ".join(f'"{name}"' for name, row in MATERIALS.items() if row.law == law)
+                raise ValueError(f'{key} is for material = {names}; remove it, as "{self.material}" has none')
+        return self
+
+    @property
+    def row(self) -> MaterialRow:
+        """Its material's row of the table."""
+        return MATERIALS[self.material]
+
+    def value(self, key: str) -> float:
+        """A parameter of the material, or 0 where its law has none: the job's own, else that of the table."""
+        own = getattr(self, key)
+        return float((own if own is not None else getattr(self.row, key)) or 0.0)
+
+    @property
+    def spacing(self) -> float:
+        """Distance of particles at rest [m]."""
+        return self.cell_size / PARTICLES_PER_CELL_EDGE
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        """Lamé's mu and lambda [Pa]."""
+        young, poisson = self.value("young_modulus"), self.value("poisson_ratio")
+        shear = young / (2.0 * (1.0 + poisson))
+        return shear, 2.0 * shear * poisson / (1.0 - 2.0 * poisson)
+
+    @property
+    def wave_speed(self) -> float:
+        """Speed of compression waves at rest [m/s], sqrt((lambda + 2 mu)/rho)."""
+        shear, second = self.lame
+        return math.sqrt((second + 2.0 * shear) / self.value("density"))
+
+    @property
+    def longest_step(self) -> float:
+        """Largest stable step of the material as it starts [s]."""
+        return self.cfl * WAVE_NUMBER * self.cell_size / self.wave_speed
+
+
+SHARED_KEYS = ("cell_size", "cfl")
+"""Keys that all soft bodies of a job share, as they share a grid and its steps."""
+
+
+def shared_conflicts(bodies: Sequence[SoftParameters]) -> list[tuple[int, str, str]]:
+    """Reasons for which soft bodies cannot share a grid: number of the body, its key, and a sentence."""
+    return [
+        (
+            number,
+            key,
+            f'is {getattr(body, key):g}, but {getattr(bodies[0], key):g} in soft[0] "{bodies[0].name}"; '
+            "all soft bodies share it",
+        )
+        for number, body in enumerate(bodies[1:], start=1)
+        for key in SHARED_KEYS
+        if getattr(body, key) != getattr(bodies[0], key)
+    ]

@@ -1,0 +1,288 @@
+"""Soft matter: all bodies of sand, snow, jelly or clay of a scene, on one sparse grid."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.core.arrays import on_device
+from sim.core.box import box_of
+from sim.core.domain import DomainParameters
+from sim.core.host_access import add, copied, viewed
+from sim.core.parameters import Vector3
+from sim.core.reductions import LaneReduction
+from sim.core.snapshots import Snapshot
+from sim.core.solver import Arrays, Diagnostics, Remedies
+from sim.forces.field import ForceField
+from sim.shapes.filled_volume import Surroundings, pack
+from sim.shapes.placement import build_solid
+from sim.soft.blocks import NODES, BlockGrid
+from sim.soft.contact import BodyContacts, stop_at_walls
+from sim.soft.laws import Laws
+from sim.soft.materials import Law
+from sim.soft.parameters import SoftParameters, shared_conflicts
+from sim.soft.transfers import (
+    COUNTS,
+    MAXIMA,
+    Nodes,
+    Particles,
+    Sorted,
+    Weights,
+    grid_to_particles,
+    measure,
+    particles_to_grid,
+    push_particles,
+)
+
+if TYPE_CHECKING:
+    from sim.shapes.solid import Solid
+
+SOLVER_NAME = "soft"
+
+MOTION_NUMBER = 0.3  # cells that a particle crosses in it
+
+STATE = ("position", "velocity", "affine", "strain", "stress", "history", "body")
+"""Arrays that a checkpoint has."""
+
+TINY_SPEED = 1.0e-12  # of what does not move at all [m/s]
+
+RUNAWAY_SPEED = 1.0e4  # no soft matter of a film moves at thirty times the speed of sound [m/s]
+
+
+class SoftSolver:
+    """All soft matter of a scene, which meets itself, walls and rigid bodies on the nodes of one grid.
+
+    One step: masses and momenta of particles go to the nodes, with the impulses of their stresses; nodes are
+    accelerated, and collide with bodies and walls; velocities go back to the particles, which move, are strained, and
+    yield (`sim.soft.transfers`). Momentum and angular momentum are kept but for rounding (Jiang et al. 2015).
+
+    Attributes:
+        parameters: the bodies, in the order of the job.
+        gravity: [m/s²]; may be changed between frames.
+        contacts: rigid bodies that soft matter meets; None where there are none.
+        particles: for kernels.
+        mass: of all particles at the start [kg].
+
+    Raises:
+        ShapeError: a shape cannot be built.
+        ValueError: bodies that cannot share a grid, a block without a particle, a domain that is too large.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[SoftParameters],
+        *,
+        domain: DomainParameters,
+        gravity: Vector3,
+        solids: Sequence[Solid] = (),
+        forces: ForceField | None = None,
+    ) -> None:
+        self.name, self.parameters, self.gravity = SOLVER_NAME, tuple(parameters), gravity
+        if conflicts := shared_conflicts(self.parameters):
+            number, key, message = conflicts[0]
+            raise ValueError(f'soft "{self.parameters[number].name}": {key} {message}')
+        position, velocity, body, volume = _filled(self.parameters, domain, solids)
+        n = len(position)
+        density = np.array([each.value("density") for each in self.parameters])
+        particle_mass = density * volume
+        self.mass = float(particle_mass[body].sum())
+        matrices = [ti.Matrix.ndarray(3, 3, ti.f32, n) for _ in range(3)]
+        self.particles = Particles(
+            on_device(position), on_device(velocity), *matrices, ti.ndarray(ti.f32, n), on_device(body), n
+        )
+        self._weights = Weights(
+            on_device(particle_mass),
+            on_device(np.full(len(parameters), volume)),
+            on_device(np.array([each.friction for each in self.parameters])),
+        )
+        self._laws = _laws_of(self.parameters)
+        self._ordered = Sorted(
+            *(ti.Vector.ndarray(3, ti.f32, n) for _ in range(2)),
+            ti.Matrix.ndarray(3, 3, ti.f32, n),
+            *(ti.ndarray(ti.f32, n) for _ in range(2)),
+        )
+        self._grid = BlockGrid(domain, self.parameters[0].cell_size, n)
+        self._make_nodes()
+        self._box = box_of(domain)
+        self._forces = (forces or ForceField(())).on([(each.name,) for each in self.parameters])
+        self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
+        self.contacts: BodyContacts | None = None
+        self._started = n
+        self._measure()
+
+    def _make_nodes(self) -> None:
+        room = self._grid.blocks.room * NODES
+        self._nodes = Nodes(ti.ndarray(ti.f32, room), ti.Vector.ndarray(3, ti.f32, room), ti.ndarray(ti.f32, room))
+
+    def _measure(self) -> None:
+        """Note how fast particles are, how hard, and whether all are finite."""
+        results = measure(self.particles, self._laws, self._reduction.over(self.particles.count))
+        squared_speed, self._hardened, self._bad = self._reduction.unpack(results).tolist()
+        self._speed = math.sqrt(squared_speed)
+
+    # --- the step ---------------------------------------------------------------------------------------------------
+
+    def stable_dt(self) -> float:
+        """Largest step [s] in which neither waves nor particles cross more than a part of a cell."""
+        shared, fall = self.parameters[0], float(np.linalg.norm(self.gravity)) + self._forces.largest_acceleration
+        by_waves = min(
+            each.longest_step / (math.sqrt(self._hardened) if each.row.law == Law.SNOW else 1.0)
+            for each in self.parameters
+        )
+        way = shared.cfl * MOTION_NUMBER * shared.cell_size
+        return min(by_waves, way / max(self._speed, math.sqrt(way * fall), TINY_SPEED))
+
+    def substep(self, dt: float) -> None:
+        """Advance by dt [s]."""
+        particles, grid = self.particles, self._grid
+        if self._forces.accelerates:
+            push_particles(particles, self._forces.now, dt)
+        if grid.sort(particles.position, particles.body):
+            self._make_nodes()
+        blocks, stored = grid.blocks, grid.count
+        particles_to_grid(
+            blocks, stored, particles, self._weights, self._ordered, self._nodes, ti.math.vec3(self.gravity), dt
+        )
+        if self.contacts is not None:
+            self.contacts.resolve(blocks, stored, self._nodes, dt)
+        stop_at_walls(blocks, stored, self._nodes, self._box)
+        grid_to_particles(blocks, stored, particles, self._laws, self._nodes, self._box, dt)
+        self._measure()
+
+    def begin_frame(self, time_s: float) -> None:
+        """Nothing is counted by frames."""
+
+    # --- what others ask --------------------------------------------------------------------------------------------
+
+    def _rows(self, name: str) -> NDArray[np.bool_]:
+        number = [each.name for each in self.parameters].index(name)
+        rows: NDArray[np.bool_] = copied(self.particles.body) == number
+        return rows
+
+    def snapshots(self) -> dict[str, Snapshot]:
+        """Particles of each body."""
+        body, position, velocity = (
+            copied(array) for array in (self.particles.body, self.particles.position, self.particles.velocity)
+        )
+        return {
+            each.name: Snapshot(
+                "soft",
+                {
+                    "position": position[body == number],
+                    "velocity": velocity[body == number],
+                    "particle_id": np.flatnonzero(body == number).astype(np.int32),
+                },
+                {"radius": 0.5 * each.spacing, "material": each.material},
+            )
+            for number, each in enumerate(self.parameters)
+        }
+
+    def view(self, body: str) -> dict[str, NDArray[np.generic]]:
+        """Positions [m] and velocities [m/s] of a body's particles, (n, 3) each."""
+        rows = self._rows(body)
+        return {"position": viewed(self.particles.position)[rows], "velocity": viewed(self.particles.velocity)[rows]}
+
+    def push(self, body: str, change: NDArray[np.floating]) -> None:
+        """Change velocities of a body's particles by (n, 3) or (3,) [m/s]."""
+        rows = np.flatnonzero(self._rows(body))
+        add(self.particles.velocity, rows, np.broadcast_to(change, (len(rows), 3)))
+        self._measure()
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """All arrays of the particles."""
+        return {name: copied(getattr(self.particles, name)) for name in STATE}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint. Raises ValueError when it does not fit."""
+        for name in STATE:
+            array = getattr(self.particles, name)
+            expected = (*array.shape, *array.element_shape)
+            if arrays[name].shape != expected:
+                raise ValueError(f"{name} of the checkpoint has shape {arrays[name].shape}, not {expected}")
+            array.from_numpy(np.ascontiguousarray(arrays[name]))
+        self._measure()
+
+    def diagnostics(self) -> Diagnostics:
+        """Momentum, energies and sizes."""
+        body = copied(self.particles.body)
+        inside = body >= 0
+        mass = copied(self._weights.mass)[body[inside]].astype(np.float64)
+        position, velocity = (
+            copied(array)[inside].astype(np.float64) for array in (self.particles.position, self.particles.velocity)
+        )
+        momentum = mass @ velocity
+        return {
+            "particle_count": float(inside.sum()),
+            "particles_left": float(self._started - inside.sum()),
+            "mass": float(mass.sum()),
+            "max_speed": self._speed,
+            "kinetic_energy": float(0.5 * mass @ (velocity**2).sum(axis=1)),
+            "momentum_x": float(momentum[0]),
+            "momentum_y": float(momentum[1]),
+            "momentum_z": float(momentum[2]),
+            "centre_of_mass_z": float(mass @ position[:, 2] / mass.sum()) if len(mass) else 0.0,
+            "blocks": float(self._grid.count),
+        }
+
+    def remedies(self) -> Remedies:
+        """What may help where it fails."""
+        stiffest = max(self.parameters, key=lambda each: each.wave_speed)
+        return Remedies(
+            runaway=f"set soft.cfl below {self.parameters[0].cfl:g}",
+            short_steps=f"lower soft.{stiffest.name}.young_modulus, whose waves run at {stiffest.wave_speed:.3g} m/s, "
+            "or use a larger cell_size",
+        )
+
+    def first_bad_quantity(self) -> str | None:
+        """The first non-finite or runaway quantity, in words."""
+        if self._bad > 0.0:
+            return f"{self._bad:.0f} particles have a position or velocity that is not finite"
+        if self._speed > RUNAWAY_SPEED:
+            return f"a particle moves at {self._speed:.3g} m/s"
+        return None
+
+
+def _filled(
+    parameters: Sequence[SoftParameters], domain: DomainParameters, solids: Sequence[Solid]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], float]:
+    """Positions [m], velocities [m/s] and bodies of the particles that fill all blocks, and the volume of each [m³]."""
+    spacing = parameters[0].spacing
+    positions, velocities = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
+    bodies: list[NDArray[np.int32]] = []
+    filled: list[Solid] = []
+    for index, soft in enumerate(parameters):
+        for number, block in enumerate(soft.block):
+            solid = build_solid(block)
+            around = Surroundings.in_domain(domain, solids, filled)
+            points = pack(solid, spacing, around, np.concatenate(positions))
+            filled.append(solid)
+            if not len(points):
+                raise ValueError(
+                    f'soft "{soft.name}" block[{number}] has no particle: it is outside the domain, inside solids, or '
+                    "filled by the blocks before it"
+                )
+            positions.append(points)
+            velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
+            bodies.append(np.full(len(points), index, dtype=np.int32))
+    return np.concatenate(positions), np.concatenate(velocities), np.concatenate(bodies), spacing**3
+
+
+def _laws_of(parameters: Sequence[SoftParameters]) -> Laws:
+    """Materials for kernels."""
+    rows = []
+    for each in parameters:
+        mu, lam = each.lame
+        # Shear of tan(phi) p, |s| = sqrt(2) tan(phi) p, with p = (3 lambda + 2 mu)/3 of the strain of volume.
+        slope = math.sqrt(2.0) / 3.0 * math.tan(math.radians(each.value("friction_angle_deg")))
+        # A shear of the cohesion is on the cone where the strain of volume is 0.
+        tip = math.sqrt(2.0) * each.value("cohesion") / ((3.0 * lam + 2.0 * mu) * slope) if slope > 0.0 else 0.0
+        yielding = math.sqrt(2.0 / 3.0) * each.value("yield_stress") / (2.0 * mu)
+        least, most = 1.0 - each.value("critical_compression"), 1.0 + each.value("critical_stretch")
+        rows.append((mu, lam, slope, tip, yielding, least, most, each.value("hardening")))
+    law = np.array([int(each.row.law) for each in parameters], dtype=np.int32)
+    return Laws(on_device(law), *(on_device(np.array(column)) for column in zip(*rows, strict=True)))
