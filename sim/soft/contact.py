@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors, on_device
 from sim.core.box import Box
 from sim.core.bundles import bundle, func
-from sim.core.host_access import put, take
+from sim.core.host_access import copied, put, take
 from sim.core.launch import kernel
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.moving_shapes import Bodies, MovingShapes, distance_of, normal_of, velocity_at
@@ -34,6 +34,7 @@ PARTS = 64  # of each sum, so that few threads meet at a number
 QUANTA = 2.0**56  # of a sum, whose terms are over what they are at most together
 TERMS = 27  # of a body's sums: 6 of J'P (v - v_body), 21 of J'P J, its upper triangle
 UPPER = np.triu_indices(6)
+UPPER_PLACE = {(int(row), int(column)): place for place, (row, column) in enumerate(zip(*UPPER, strict=True))}
 SLOW = 1.0e-12  # speed along a surface at which there is no direction of it [m/s]
 
 
@@ -66,8 +67,9 @@ class BodyContacts:
     """
 
     def __init__(self, geometries: Sequence[BodyGeometry], moving: int, friction: Sequence[float], mass: float) -> None:
-        self._geometries, self._moving, self._mass = tuple(geometries), moving, mass
+        self._moving, self._mass = moving, mass
         self._shapes = MovingShapes(geometries)
+        self._radius = copied(self._shapes.shapes.radius).astype(np.float64)
         count = len(geometries)
         self._position, self._velocity, self._spin = (np.zeros((count, 3)) for _ in range(3))
         self._rotation = np.tile(np.eye(3), (count, 1, 1))
@@ -135,7 +137,7 @@ class BodyContacts:
             inverse[:3, :3] = self._inverse_mass[number] * np.eye(3)
             inverse[3:, 3:] = self._inverse_inertia[number]
             # Angular parts are summed over a radius, as the device has them.
-            scale = np.repeat([1.0, self._geometries[number].radius], 3)
+            scale = np.repeat([1.0, self._radius[number]], 3)
             matrix *= scale[:, None] * scale
             momentum = touching.speed_unit * scale * sums[number, :6]
             gains[number] = np.linalg.solve(np.eye(6) + inverse @ matrix, inverse @ momentum)
@@ -147,8 +149,7 @@ class BodyContacts:
         touching = self._touching
         sums = take(touching.impulse).astype(np.float64).reshape(-1, 6, PARTS).sum(axis=2)
         sums *= self._mass * touching.speed_unit / QUANTA
-        radius = np.array([geometry.radius for geometry in self._geometries]).reshape(-1, 1)
-        return sums[:, :3], radius * sums[:, 3:]
+        return sums[:, :3], self._radius[:, None] * sums[:, 3:]
 
 
 @func
@@ -212,22 +213,21 @@ def sum_collisions(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touch
                         add_parts(touching.sums, body * TERMS + k, n, stops[k])
                         add_parts(touching.sums, body * TERMS + 3 + k, n, turns[k])
                     # Columns of P J, and J' of each.
-                    place = 6
                     for row in ti.static(range(6)):
-                        motion = ti.math.vec3(0.0)
-                        if ti.static(row < 3):
-                            motion[ti.static(row % 3)] = 1.0
-                        else:
-                            axis = ti.math.vec3(0.0)
-                            axis[ti.static(row % 3)] = 1.0
-                            motion = axis.cross(arm)
+                        unit = ti.math.vec3(0.0)
+                        unit[ti.static(row % 3)] = 1.0
+                        motion = unit
+                        if ti.static(row >= 3):
+                            motion = unit.cross(arm)
                         through = motion.dot(normal)
                         held = mass * (through * normal + kept * (motion - through * normal))
                         twist = arm.cross(held)
                         for column in ti.static(range(row, 6)):
-                            value = ti.static(held if column < 3 else twist)[ti.static(column % 3)]
-                            add_parts(touching.sums, body * TERMS + place + ti.static(column - row), n, value)
-                        place += ti.static(6 - row)
+                            place = ti.static(6 + UPPER_PLACE[row, column])
+                            value = held[ti.static(column % 3)]
+                            if ti.static(column >= 3):
+                                value = twist[ti.static(column % 3)]
+                            add_parts(touching.sums, body * TERMS + place, n, value)
 
 
 @kernel

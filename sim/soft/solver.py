@@ -100,7 +100,7 @@ class SoftSolver:
             on_device(np.full(len(parameters), volume)),
             on_device(np.array([each.friction for each in self.parameters])),
         )
-        self._laws = _laws_of(self.parameters)
+        self._laws = laws_of(self.parameters)
         self._ordered = Sorted(
             *(ti.Vector.ndarray(3, ti.f32, n) for _ in range(2)),
             ti.Matrix.ndarray(3, 3, ti.f32, n),
@@ -272,7 +272,7 @@ def _filled(
     return np.concatenate(positions), np.concatenate(velocities), np.concatenate(bodies), spacing**3
 
 
-def _laws_of(parameters: Sequence[SoftParameters]) -> Laws:
+def laws_of(parameters: Sequence[SoftParameters]) -> Laws:
     """Materials for kernels."""
     rows = []
     for each in parameters:
