@@ -38,10 +38,10 @@ class MaterialRow:
 
 MATERIALS: dict[str, MaterialRow] = {
     "sand": MaterialRow(
-        Law.SAND, 1600.0, 1.0e6, 0.3, friction_angle_deg=33.0, cohesion=0.0, about="dry sand (Klár et al. 2016)"
+        Law.SAND, 1600.0, 3.5e5, 0.3, friction_angle_deg=33.0, cohesion=0.0, about="dry sand (Klár et al. 2016)"
     ),
     "wet_sand": MaterialRow(
-        *(Law.SAND, 1900.0, 1.0e6, 0.3),
+        *(Law.SAND, 1900.0, 3.5e5, 0.3),
         friction_angle_deg=35.0,
         cohesion=1500.0,
         about="sand that keeps the shape of its bucket",
