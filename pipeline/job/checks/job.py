@@ -64,12 +64,12 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
 
 def _check_bodies(job: Job, findings: Findings) -> None:
     found = list(bodies(job))
+    tables = [f"[[{name}]]" for name in KINDS]
     if not found:
-        tables = [f"[[{name}]]" for name in KINDS]
         findings.error((), f"has no body; add {', '.join(tables[:-1])} or {tables[-1]}")
     elif not (job.moving_bodies or job.placed_camera.moves or any(kind is not RIGID for _, kind, _ in found)):
-        others = [name for name in KINDS if name != RIGID.name]
-        findings.warn((), f"has neither {' nor '.join(others)}, so nothing will move")
+        others = [table for table in tables if table != f"[[{RIGID.name}]]"]
+        findings.warn((), f"has no {', '.join(others[:-1])} or {others[-1]}, so nothing will move")
     # Names become file names, and some file systems do not tell upper from lower case.
     taken: dict[str, KeyPath] = {}
     for path, kind, body in found:
