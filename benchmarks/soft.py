@@ -1,6 +1,6 @@
 """Time of soft matter: steps of a falling cube, beside the example of MLS-MPM that Taichi ships; JSON.
 
-    python -m benchmarks.soft [--particles 100000 1000000] [--materials jelly sand] [--steps 30] [--device cuda] [--peer]
+    python -m benchmarks.soft [--particles 100000 1000000] [--materials jelly sand] [--steps 30] [--peer]
 
 Of each material and number of particles: medians of whole steps, the host's waits included, and memory of a particle
 with its share of the grid. `--peer` takes the same cube, cells and steps with `mpm3d_ggui.py` of Taichi's examples

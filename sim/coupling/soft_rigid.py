@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,9 @@ def contacts_of_soft(
         return None
     still = [BodyGeometry.of(body.solid) for body in static]
     geometries = [*(() if rigid is None else rigid.solids), *still]
-    contacts = BodyContacts(geometries, len(moving), [body.friction for body in (*moving, *standing)], soft.mass)
+    own = soft.parameters[0].friction
+    friction = [math.sqrt(own * body.friction) for body in (*moving, *standing)]
+    contacts = BodyContacts(geometries, len(moving), friction, soft.mass)
     rotation = np.array([body.solid.rotation for body in static]).reshape(-1, 3, 3)
     position = np.array([body.solid.position for body in static]).reshape(-1, 3)
     centre = np.array([geometry.centre_of_mass for geometry in still]).reshape(-1, 3)

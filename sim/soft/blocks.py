@@ -22,7 +22,7 @@ EDGE = 4  # nodes along the edge of a block
 NODES = EDGE**3
 SUPPORT = 3  # nodes along an axis that a particle has a share in
 RING = 3  # nodes around the domain: what particles at its faces reach, and one
-GROWTH = 1.3
+GROWTH = 1.1
 MOST_BLOCKS = 2**28
 
 Triple = ti.types.vector(3, ti.i32)
@@ -38,6 +38,8 @@ class Blocks(NamedTuple):
     mark: Integers  # of each block of the lattice: whether it holds bases, then its number, (blocks,)
     number: Integers  # of each block of the lattice, -1 where it is not stored, (blocks + 1,)
     place: Integers  # of each stored block in the lattice, (k,)
+    ahead: Integers  # numbers of a block and the seven that follow it along the axes, x first, -1 for none, (8 k,)
+    behind: Integers  # of a block and the seven before it
     first: Integers  # first sorted particle of each cell, (k * NODES + 1,)
     cursor: Integers  # of the sort, (k * NODES,)
     scratch: Integers
@@ -99,6 +101,8 @@ class BlockGrid:
         self.blocks = Blocks(
             **self._lattice,
             place=ti.ndarray(ti.i32, room),
+            ahead=ti.ndarray(ti.i32, 8 * room),
+            behind=ti.ndarray(ti.i32, 8 * room),
             first=ti.ndarray(ti.i32, cells + 1),
             cursor=ti.ndarray(ti.i32, cells),
             scratch=ti.ndarray(ti.i32, scan_scratch_length(max(cells, self._total))),
@@ -128,6 +132,21 @@ def within_block(node: Triple) -> ti.i32:
 def node_at(node: Triple, blocks: Blocks) -> ti.i32:
     """Number of a stored node."""
     return blocks.number[block_of(node, blocks)] * NODES + within_block(node)
+
+
+@func
+def node_ahead(block: ti.i32, node: Triple, blocks: Blocks) -> ti.i32:
+    """Number of a node of coordinates from 0 to 6 in a stored block, or in one of those that follow it."""
+    next_block = (int(node[2] > 3) * 2 + int(node[1] > 3)) * 2 + int(node[0] > 3)
+    return blocks.ahead[8 * block + next_block] * NODES + within_block(node)
+
+
+@func
+def cell_behind(block: ti.i32, node: Triple, blocks: Blocks) -> ti.i32:
+    """Number of a cell of coordinates from -2 to 3 in a stored block, or in one of those before it; negative where
+    it is not stored."""
+    last_block = (int(node[2] < 0) * 2 + int(node[1] < 0)) * 2 + int(node[0] < 0)
+    return blocks.behind[8 * block + last_block] * NODES + within_block(node)
 
 
 @func
@@ -182,9 +201,19 @@ def find_blocks(blocks: Blocks, position: Vectors, body: Integers, count: ti.i32
 
 @kernel
 def sort_by_cell(blocks: Blocks, stored: ti.i32, count: ti.i32):
-    """Counting sort; particles of a cell by number. Threads race for the places in a cell, a sort by insertion settles
-    it."""
+    """Neighbours of blocks, and a counting sort, particles of a cell by number.
+
+    Threads race for the places in a cell, a sort by insertion settles it.
+    """
     cells = stored * NODES
+    for k in range(8 * stored):
+        place = blocks.place[k // 8]
+        step = ((k // 4 % 2) * blocks.shape[1] + k // 2 % 2) * blocks.shape[0] + k % 2
+        blocks.ahead[k] = blocks.number[place + step]
+        behind = -1
+        if place >= step:
+            behind = blocks.number[place - step]
+        blocks.behind[k] = behind
     for c in range(cells):
         blocks.cursor[c] = 0
     for p in range(count):

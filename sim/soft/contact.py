@@ -46,7 +46,7 @@ class Touching(NamedTuple):
     count: ti.i32
     radius: Floats  # of a sphere around the centre of mass that holds the body [m]
     step: Floats  # half width of differences for normals [m]
-    friction: Floats  # [-]
+    friction: Floats  # of soft matter against each [-]
     is_free: Integers
     gain: Vectors  # change of velocity in the collision [m/s]
     turn: Vectors  # of spin [1/s]
@@ -62,7 +62,7 @@ class BodyContacts:
     Args:
         geometries: of all bodies, one at least.
         moving: how many of them, the first ones, may move.
-        friction: of all bodies [-].
+        friction: of soft matter against each body [-].
         mass: of all soft matter [kg].
     """
 
@@ -176,12 +176,6 @@ def slid(velocity: ti.math.vec3, normal: ti.math.vec3, friction: ti.f32) -> ti.m
 
 
 @func
-def pair_friction(nodes: Nodes, n: ti.i32, body: ti.i32, touching: Touching) -> ti.f32:
-    """Friction of a node against a body [-]."""
-    return ti.sqrt(nodes.friction[n] * touching.friction[body])
-
-
-@func
 def add_parts(sums: LongIntegers, at: ti.i32, n: ti.i32, value: ti.f32):
     """Add to a sum, in one of its parts."""
     ti.atomic_add(sums[at * PARTS + n % PARTS], ti.cast(value * ti.static(QUANTA), ti.i64))
@@ -203,7 +197,7 @@ def sum_collisions(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touch
                 into = velocity.dot(normal)
                 if into < 0.0:
                     along = velocity - into * normal
-                    friction = pair_friction(nodes, n, body, touching)
+                    friction = touching.friction[body]
                     kept = ti.min(1.0, -friction * into / ti.max(along.norm(), SLOW))
                     mass = nodes.mass[n] / touching.mass_unit
                     arm = (x - touching.bodies.position[body]) / touching.radius[body]
@@ -242,7 +236,7 @@ def collide(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touching):
                 frame = velocity_at(x, body, touching.bodies) + touching.gain[body] + touching.turn[body].cross(arm)
                 normal = normal_of(x, body, touching.step[body], touching.bodies)
                 before = nodes.velocity[n]
-                after = frame + slid(before - frame, normal, pair_friction(nodes, n, body, touching))
+                after = frame + slid(before - frame, normal, touching.friction[body])
                 nodes.velocity[n] = after
                 if touching.is_free[body] == 1:
                     share = nodes.mass[n] / touching.mass_unit
@@ -254,7 +248,7 @@ def collide(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touching):
 
 
 @kernel
-def stop_at_walls(blocks: Blocks, stored: ti.i32, nodes: Nodes, box: Box):
+def stop_at_walls(blocks: Blocks, stored: ti.i32, nodes: Nodes, box: Box, friction: ti.f32):
     """Let nodes on and behind the closed faces of the domain move along them or away."""
     slack = 1.0e-3 * blocks.edge
     for n in range(stored * NODES):
@@ -268,5 +262,5 @@ def stop_at_walls(blocks: Blocks, stored: ti.i32, nodes: Nodes, box: Box):
                 elif x[axis] > box.wall_high[axis] - slack:
                     normal[axis] = -1.0
                 if normal[axis] != 0.0:
-                    velocity = slid(velocity, normal, nodes.friction[n])
+                    velocity = slid(velocity, normal, friction)
             nodes.velocity[n] = velocity

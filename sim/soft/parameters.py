@@ -65,7 +65,8 @@ class SoftParameters(Parameters):
     )
     friction: NonNegative = Field(
         default=0.5,
-        description="Friction against walls and bodies [-]; with a body that of the pair is the root of the product.",
+        description="Friction against walls and bodies [-], one for all soft bodies; with a body that of the pair is "
+        "the root of the product.",
     )
     cfl: Positive = Field(default=1.0, le=1.5, description="Factor on the largest stable step [-].")
 
@@ -111,7 +112,7 @@ class SoftParameters(Parameters):
         return self.cfl * WAVE_NUMBER * self.cell_size / self.wave_speed
 
 
-SHARED_KEYS = ("cell_size", "cfl")
+SHARED_KEYS = ("cell_size", "friction", "cfl")
 """Keys that all soft bodies of a job share, as they share a grid and its steps."""
 
 

@@ -29,9 +29,10 @@ from sim.soft.parameters import SoftParameters, shared_conflicts
 from sim.soft.transfers import (
     COUNTS,
     MAXIMA,
+    SHARES,
     Nodes,
     Particles,
-    Sorted,
+    Shares,
     Weights,
     grid_to_particles,
     measure,
@@ -98,14 +99,8 @@ class SoftSolver:
         self._weights = Weights(
             on_device(particle_mass),
             on_device(np.full(len(parameters), volume)),
-            on_device(np.array([each.friction for each in self.parameters])),
         )
         self._laws = laws_of(self.parameters)
-        self._ordered = Sorted(
-            *(ti.Vector.ndarray(3, ti.f32, n) for _ in range(2)),
-            ti.Matrix.ndarray(3, 3, ti.f32, n),
-            *(ti.ndarray(ti.f32, n) for _ in range(2)),
-        )
         self._grid = BlockGrid(domain, self.parameters[0].cell_size, n)
         self._make_nodes()
         self._box = box_of(domain)
@@ -117,7 +112,10 @@ class SoftSolver:
 
     def _make_nodes(self) -> None:
         room = self._grid.blocks.room * NODES
-        self._nodes = Nodes(ti.ndarray(ti.f32, room), ti.Vector.ndarray(3, ti.f32, room), ti.ndarray(ti.f32, room))
+        self._nodes, self._shares = (
+            kind(ti.ndarray(ti.f32, length), ti.Vector.ndarray(3, ti.f32, length))
+            for kind, length in ((Nodes, room), (Shares, SHARES * room))
+        )
 
     def _measure(self) -> None:
         """Note how fast particles are, how hard, and whether all are finite."""
@@ -146,11 +144,11 @@ class SoftSolver:
             self._make_nodes()
         blocks, stored = grid.blocks, grid.count
         particles_to_grid(
-            blocks, stored, particles, self._weights, self._ordered, self._nodes, ti.math.vec3(self.gravity), dt
+            blocks, stored, particles, self._weights, self._shares, self._nodes, ti.math.vec3(self.gravity), dt
         )
         if self.contacts is not None:
             self.contacts.resolve(blocks, stored, self._nodes, dt)
-        stop_at_walls(blocks, stored, self._nodes, self._box)
+        stop_at_walls(blocks, stored, self._nodes, self._box, self.parameters[0].friction)
         grid_to_particles(blocks, stored, particles, self._laws, self._nodes, self._box, dt)
         self._measure()
 

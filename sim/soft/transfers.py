@@ -3,8 +3,8 @@
     m_i v_i = sum_p w_ip [m_p v_p + (m_p C_p - dt V_p 4/h² tau_p) (x_i - x_p)]
     v_p = sum_i w_ip v_i,   C_p = 4/h² sum_i w_ip v_i (x_i - x_p)'
 
-Nodes gather from the particles of the 27 cells that reach them, in the order of these: nothing is added by threads that
-race, so that bits do not depend on them.
+Each cell adds up what its particles give to each of their 27 nodes, and each node what 27 cells give it, in fixed
+orders: nothing is added by threads that race, so that bits do not depend on them.
 """
 
 from typing import NamedTuple
@@ -13,14 +13,27 @@ import taichi as ti
 
 from sim.core.arrays import Floats, Integers, Matrices, Vectors
 from sim.core.box import Box
-from sim.core.bundles import bundle
+from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
-from sim.core.reductions import Results, Share, is_finite, reduced_tree
+from sim.core.reductions import Results, Share, is_finite, reduced_tree, runs_on_gpu
 from sim.forces.field import ForceTable, change_of_velocity
-from sim.soft.blocks import NODES, SUPPORT, Blocks, Triple, base_of, block_of, node_at, node_of, within_block
+from sim.soft.blocks import (
+    EDGE,
+    NODES,
+    SUPPORT,
+    Blocks,
+    Triple,
+    base_of,
+    block_of,
+    cell_behind,
+    node_ahead,
+    place_of_node,
+)
 from sim.soft.laws import Laws, hardened, moved_strain, respond
 from sim.soft.materials import Law
 
+SHARES = SUPPORT**3
+WARP = 32  # threads of a GPU that read together
 APIC = 4.0  # over h², the inverse of the splines' second moment
 MAXIMA, COUNTS = 2, 1  # of `measure`
 
@@ -31,7 +44,7 @@ class Particles(NamedTuple):
 
     position: Vectors  # [m]
     velocity: Vectors  # [m/s]
-    affine: Matrices  # C [1/s]
+    affine: Matrices  # C [1/s]; within a step its momentum [kg/s]
     strain: Matrices  # elastic b - 1 [-]
     stress: Matrices  # Kirchhoff [Pa]
     history: Floats  # of the law [-]
@@ -41,22 +54,18 @@ class Particles(NamedTuple):
 
 @bundle
 class Weights(NamedTuple):
-    """Mass of a particle of each body [kg], its volume at rest [m³], and the body's friction, (bodies,)."""
+    """Mass of a particle of each body [kg], and its volume at rest [m³], (bodies,)."""
 
     mass: Floats
     volume: Floats
-    friction: Floats
 
 
 @bundle
-class Sorted(NamedTuple):
-    """What nodes gather of particles, by cell, (n,) each."""
+class Shares(NamedTuple):
+    """What the particles of each cell give each of their 27 nodes, (k * 64 * 27,); of no meaning in empty cells."""
 
-    place: Vectors  # [lattice edges]
-    momentum: Vectors  # [kg m/s]
-    affine: Matrices  # of the momentum, over a lattice edge [kg m/s]
     mass: Floats  # [kg]
-    friction: Floats  # mass times friction [kg]
+    momentum: Vectors  # [kg m/s]
 
 
 @bundle
@@ -65,7 +74,6 @@ class Nodes(NamedTuple):
 
     mass: Floats  # [kg]
     velocity: Vectors  # [m/s]
-    friction: Floats  # against walls and bodies [-]
 
 
 @kernel
@@ -85,53 +93,75 @@ def spline(distance: ti.f32) -> ti.f32:
     return ti.select(d < 0.5, 0.75 - d * d, 0.5 * ti.max(1.5 - d, 0.0) ** 2)
 
 
+@func
+def give(
+    cell: ti.i32,
+    corner: ti.math.vec3,
+    lane: ti.i32,
+    blocks: Blocks,
+    particles: Particles,
+    masses: Floats,
+    shares: Shares,
+):
+    """What the particles of a cell, whose lowest node is at a corner [m], give to one of their nodes."""
+    offset = ti.math.vec3(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2)
+    at = corner + blocks.edge * offset
+    scale = 1.0 / blocks.edge
+    mass = 0.0
+    momentum = ti.math.vec3(0.0)
+    for s in range(blocks.first[cell], blocks.first[cell + 1]):
+        p = blocks.order[s]
+        away = at - particles.position[p]
+        weight = spline(scale * away[0]) * spline(scale * away[1]) * spline(scale * away[2])
+        own = masses[particles.body[p]]
+        mass += weight * own
+        momentum += weight * (own * particles.velocity[p] + particles.affine[p] @ away)
+    place = cell * SHARES + lane
+    shares.mass[place] = mass
+    shares.momentum[place] = momentum
+
+
 @kernel
 def particles_to_grid(
     blocks: Blocks,
     stored: ti.i32,
     particles: Particles,
     weights: Weights,
-    ordered: Sorted,
+    shares: Shares,
     nodes: Nodes,
     gravity: ti.math.vec3,
     dt: ti.f32,
 ):
-    """Mass and velocity of the nodes, gravity included."""
-    h = blocks.edge
-    for s in range(blocks.first[stored * NODES]):
-        p = blocks.order[s]
+    """Mass and velocity of the nodes, gravity included; C becomes its momentum with the impulse of the stress."""
+    for p in range(particles.count):
         b = particles.body[p]
-        mass = weights.mass[b]
-        ordered.place[s] = (particles.position[p] - blocks.origin) / h
-        ordered.momentum[s] = mass * particles.velocity[p]
-        pull = dt * weights.volume[b] * APIC / (h * h)
-        ordered.affine[s] = h * (mass * particles.affine[p] - pull * particles.stress[p])
-        ordered.mass[s] = mass
-        ordered.friction[s] = mass * weights.friction[b]
+        if b >= 0:
+            pull = dt * weights.volume[b] * APIC / (blocks.edge * blocks.edge)
+            particles.affine[p] = weights.mass[b] * particles.affine[p] - pull * particles.stress[p]
+    if ti.static(runs_on_gpu()):
+        ti.loop_config(block_dim=128)
+        for i in range(stored * (NODES * WARP)):
+            cell = i // WARP
+            if i % WARP < SHARES and blocks.first[cell] < blocks.first[cell + 1]:
+                give(cell, place_of_node(cell, blocks), i % WARP, blocks, particles, weights.mass, shares)
+    else:
+        for cell in range(stored * NODES):
+            if blocks.first[cell] < blocks.first[cell + 1]:
+                corner = place_of_node(cell, blocks)
+                for lane in range(SHARES):
+                    give(cell, corner, lane, blocks, particles, weights.mass, shares)
     for n in range(stored * NODES):
-        node = node_of(n, blocks)
-        mass, friction = 0.0, 0.0
+        inside = Triple(n % EDGE, n // EDGE % EDGE, n % NODES // (EDGE * EDGE))
+        mass = 0.0
         momentum = ti.math.vec3(0.0)
-        at = ti.cast(node, ti.f32)
-        for dz in range(SUPPORT):
-            for dy in range(SUPPORT):
-                for dx in range(SUPPORT):
-                    base = node - Triple(SUPPORT - 1 - dx, dy, dz)
-                    block = -1
-                    if base.min() >= 0:
-                        block = blocks.number[block_of(base, blocks)]
-                    if block >= 0:
-                        cell = block * NODES + within_block(base)
-                        for s in range(blocks.first[cell], blocks.first[cell + 1]):
-                            away = at - ordered.place[s]
-                            weight = spline(away[0]) * spline(away[1]) * spline(away[2])
-                            mass += weight * ordered.mass[s]
-                            friction += weight * ordered.friction[s]
-                            momentum += weight * (ordered.momentum[s] + ordered.affine[s] @ away)
+        for lane in range(SHARES):
+            base = inside - Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2)
+            cell = cell_behind(n // NODES, base, blocks)
+            if cell >= 0 and blocks.first[cell] < blocks.first[cell + 1]:
+                mass += shares.mass[cell * SHARES + lane]
+                momentum += shares.momentum[cell * SHARES + lane]
         nodes.mass[n] = mass
-        inverse = ti.select(mass > 0.0, 1.0 / ti.max(mass, 1.0e-30), 0.0)
-        nodes.velocity[n] = ti.select(mass > 0.0, inverse * momentum + dt * gravity, ti.math.vec3(0.0))
-        nodes.friction[n] = inverse * friction
+        nodes.velocity[n] = ti.select(mass > 0.0, momentum / ti.max(mass, 1.0e-30) + dt * gravity, ti.math.vec3(0.0))
 
 
 @kernel
@@ -153,13 +183,14 @@ def grid_to_particles(
         base = base_of(x, blocks)
         velocity = ti.math.vec3(0.0)
         affine = ti.math.mat3(0.0)
-        for dz in range(SUPPORT):
-            for dy in range(SUPPORT):
-                for dx in range(SUPPORT):
-                    node = base + Triple(dx, dy, dz)
-                    away = ti.cast(node, ti.f32) - place
+        block, inside = blocks.number[block_of(base, blocks)], base & (EDGE - 1)
+        for dz in ti.static(range(SUPPORT)):
+            for dy in ti.static(range(SUPPORT)):
+                for dx in ti.static(range(SUPPORT)):
+                    step = Triple(dx, dy, dz)
+                    away = ti.cast(base + step, ti.f32) - place
                     weight = spline(away[0]) * spline(away[1]) * spline(away[2])
-                    v_i = weight * nodes.velocity[node_at(node, blocks)]
+                    v_i = weight * nodes.velocity[node_ahead(block, inside + step, blocks)]
                     velocity += v_i
                     affine += v_i.outer_product(away)
         affine *= APIC / h
