@@ -113,7 +113,13 @@ class BlockGrid:
 @func
 def base_of(x: ti.math.vec3, blocks: Blocks) -> Triple:
     """Lowest node of a particle at x [m]."""
-    return ti.cast(ti.floor((x - blocks.origin) / blocks.edge - 0.5), ti.i32)
+    return ti.cast(ti.floor(place_of(x, blocks) - 0.5), ti.i32)
+
+
+@func
+def place_of(x: ti.math.vec3, blocks: Blocks) -> ti.math.vec3:
+    """Where a point [m] is in the lattice [edges]."""
+    return (x - blocks.origin) / blocks.edge
 
 
 @func

@@ -27,7 +27,8 @@ from sim.soft.blocks import (
     block_of,
     cell_behind,
     node_ahead,
-    place_of_node,
+    node_of,
+    place_of,
 )
 from sim.soft.laws import Laws, hardened, moved_strain, respond
 from sim.soft.materials import Law
@@ -44,7 +45,7 @@ class Particles(NamedTuple):
 
     position: Vectors  # [m]
     velocity: Vectors  # [m/s]
-    affine: Matrices  # C [1/s]; within a step its momentum [kg/s]
+    affine: Matrices  # C [1/s]; within a step its momentum across a cell [kg m/s]
     strain: Matrices  # elastic b - 1 [-]
     stress: Matrices  # Kirchhoff [Pa]
     history: Floats  # of the law [-]
@@ -93,26 +94,30 @@ def spline(distance: ti.f32) -> ti.f32:
     return ti.select(d < 0.5, 0.75 - d * d, 0.5 * ti.max(1.5 - d, 0.0) ** 2)
 
 
+@ti.func
+def weight_at(away: ti.math.vec3) -> ti.f32:
+    """Share of a particle in a node [-]."""
+    return spline(away[0]) * spline(away[1]) * spline(away[2])
+
+
 @func
 def give(
     cell: ti.i32,
-    corner: ti.math.vec3,
+    corner: Triple,
     lane: ti.i32,
     blocks: Blocks,
     particles: Particles,
     masses: Floats,
     shares: Shares,
 ):
-    """What the particles of a cell, whose lowest node is at a corner [m], give to one of their nodes."""
-    offset = ti.math.vec3(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2)
-    at = corner + blocks.edge * offset
-    scale = 1.0 / blocks.edge
+    """What the particles of a cell, with this lowest node, give to one of their nodes."""
+    at = ti.cast(corner + Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2), ti.f32)
     mass = 0.0
     momentum = ti.math.vec3(0.0)
     for s in range(blocks.first[cell], blocks.first[cell + 1]):
         p = blocks.order[s]
-        away = at - particles.position[p]
-        weight = spline(scale * away[0]) * spline(scale * away[1]) * spline(scale * away[2])
+        away = at - place_of(particles.position[p], blocks)
+        weight = weight_at(away)
         own = masses[particles.body[p]]
         mass += weight * own
         momentum += weight * (own * particles.velocity[p] + particles.affine[p] @ away)
@@ -136,18 +141,18 @@ def particles_to_grid(
     for p in range(particles.count):
         b = particles.body[p]
         if b >= 0:
-            pull = dt * weights.volume[b] * APIC / (blocks.edge * blocks.edge)
-            particles.affine[p] = weights.mass[b] * particles.affine[p] - pull * particles.stress[p]
+            pull = dt * weights.volume[b] * APIC / blocks.edge
+            particles.affine[p] = blocks.edge * weights.mass[b] * particles.affine[p] - pull * particles.stress[p]
     if ti.static(runs_on_gpu()):
         ti.loop_config(block_dim=128)
         for i in range(stored * (NODES * WARP)):
             cell = i // WARP
             if i % WARP < SHARES and blocks.first[cell] < blocks.first[cell + 1]:
-                give(cell, place_of_node(cell, blocks), i % WARP, blocks, particles, weights.mass, shares)
+                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, weights.mass, shares)
     else:
         for cell in range(stored * NODES):
             if blocks.first[cell] < blocks.first[cell + 1]:
-                corner = place_of_node(cell, blocks)
+                corner = node_of(cell, blocks)
                 for lane in range(SHARES):
                     give(cell, corner, lane, blocks, particles, weights.mass, shares)
     for n in range(stored * NODES):
@@ -179,7 +184,7 @@ def grid_to_particles(
     for s in range(blocks.first[stored * NODES]):
         p = blocks.order[s]
         x = particles.position[p]
-        place = (x - blocks.origin) / h
+        place = place_of(x, blocks)
         base = base_of(x, blocks)
         velocity = ti.math.vec3(0.0)
         affine = ti.math.mat3(0.0)
@@ -189,8 +194,7 @@ def grid_to_particles(
                 for dx in ti.static(range(SUPPORT)):
                     step = Triple(dx, dy, dz)
                     away = ti.cast(base + step, ti.f32) - place
-                    weight = spline(away[0]) * spline(away[1]) * spline(away[2])
-                    v_i = weight * nodes.velocity[node_ahead(block, inside + step, blocks)]
+                    v_i = weight_at(away) * nodes.velocity[node_ahead(block, inside + step, blocks)]
                     velocity += v_i
                     affine += v_i.outer_product(away)
         affine *= APIC / h
