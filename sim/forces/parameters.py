@@ -36,7 +36,8 @@ class BaseForce(Parameters):
     """What all forces have."""
 
     only: tuple[str, ...] = Field(
-        default=(), description="Names of the bodies, groups, fluids, cloths and smokes it acts on; all if omitted."
+        default=(),
+        description="Names of the bodies, groups, fluids, cloths, smokes and soft bodies it acts on; all if omitted.",
     )
     within: RegionParameters | None = Field(default=None, description="Where it acts; everywhere if omitted.")
     start_s: NonNegative = Field(default=0.0, description="When it sets in [s].")

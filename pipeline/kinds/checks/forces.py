@@ -37,6 +37,7 @@ def _feel_it(job: Job, force: BaseForce) -> bool:
         any(is_meant(smoke.name) for smoke in job.smoke)
         or any(body.air_drag > 0.0 or not of_air for body in bodies)
         or any(fluid.air_density > 0.0 or not of_air for fluid in fluids)
+        or (not of_air and any(is_meant(soft.name) for soft in job.soft))
         or any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 or not of_air for cloth in cloths)
     )
 
