@@ -196,7 +196,7 @@ def test_gravity_that_is_added_lifts_hot_smoke_as_that_of_the_job():
 
 def test_forces_on_nobody_and_on_bodies_that_break_are_refused():
     nobody = {"type": "drag", "rate": 1.0, "only": ("nobody",)}
-    with pytest.raises(ValueError, match='"nobody" is the name of no body, group, fluid, cloth or smoke'):
+    with pytest.raises(ValueError, match='"nobody" is the name of no body, group, fluid, cloth, smoke or soft body'):
         world_of(rigid=[BALL], force=[nobody])
     breaks = BALL | {"breaks": {"strength": 1e5, "pieces": 4}}
     with pytest.raises(ValueError, match="in a job with forces"):

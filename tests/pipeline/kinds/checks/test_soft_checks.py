@@ -1,0 +1,77 @@
+"""What `check` tells of soft matter."""
+
+import pytest
+from command_line import pipeline
+
+JOB = """\
+name = "it"
+frames = 2
+[domain]
+min = [-0.5, -0.5, 0.0]
+max = [0.5, 0.5, 1.0]
+[[soft]]
+name = "jelly"
+material = "jelly"
+cell_size = 0.02
+[[soft.block]]
+shape = { type = "box", size = [0.2, 0.2, 0.2] }
+position = [0.0, 0.0, 0.1]
+"""
+
+BODY = '[[rigid]]\nname = "plate"\nshape = { type = "box", size = [0.3, 0.3, 0.03] }\nposition = [0.0, 0.0, 0.4]\n'
+
+
+def told(tmp_path, text: str, *options: str) -> tuple[int, str]:
+    path = tmp_path / "it.toml"
+    path.write_text(text)
+    result = pipeline("check", path, *options)
+    return result.exit_code, result.output
+
+
+def test_a_cube_of_jelly_is_fine_and_counted(tmp_path):
+    code, output = told(tmp_path, JOB)
+    assert code == 0
+    assert "about 8,000 particles of soft matter" in output
+    assert "warning" not in output
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        (
+            "soft.jelly.young_modulus=1e9",
+            "1e+09 Pa need steps of 1.3e-06 s, 13,000 a frame; 4.3e+08 Pa or less would do",
+        ),
+        ("soft.jelly.yield_stress=10.0", 'yield_stress is for material = "clay" or "dough"'),
+        ("soft.jelly.poisson_ratio=0.5", "poisson_ratio"),
+        ("soft.jelly.block.0.position=[0,0,5]", "has no particle: it is outside the domain"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path, option, expected):
+    finer = ("--set", "soft.jelly.cell_size=0.005") if "modulus" in option else ()
+    code, output = told(tmp_path, JOB, "--set", option, *finer)
+    assert code == 2
+    assert expected in output
+
+
+def test_what_is_too_thin_for_the_grid_is_told_with_the_cells_that_would_do(tmp_path):
+    code, output = told(tmp_path, JOB + BODY)
+    assert code == 0
+    assert "is 0.03 m thin, less than 3 cells of soft matter, 0.02 m" in output
+    assert "use soft.cell_size = 0.01 or less" in output
+    _, output = told(tmp_path, JOB, "--set", "soft.jelly.block.0.shape.size=[0.2,0.2,0.05]")
+    assert "is 0.05 m thin, less than 3 cells of 0.02 m, and will be too stiff" in output
+
+
+@pytest.mark.parametrize(
+    ("other", "table"),
+    [
+        ("fluid", '[[fluid]]\nname = "water"\n[[fluid.block]]\nshape = { type = "sphere", radius = 0.1 }\n'),
+        ("cloth", '[[cloth]]\nname = "sheet"\nshape = { type = "rectangle", size = [0.3, 0.3], resolution = 0.05 }\n'),
+        ("smoke", '[[smoke]]\nname = "fog"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.1 }\n'),
+    ],
+)
+def test_a_kind_that_it_would_pass_through_is_refused_by_name(tmp_path, other, table):
+    code, output = told(tmp_path, JOB + table)
+    assert code == 2
+    assert f"soft[0]: meets walls and rigid bodies, and would pass through {other}; remove one of both" in output
