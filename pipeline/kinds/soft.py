@@ -39,6 +39,7 @@ LOOKS: dict[str, MaterialParameters] = {
     "rubber": MaterialParameters(look="rubber"),
     "clay": MaterialParameters(look="stone", color=(0.45, 0.24, 0.15)),
     "dough": MaterialParameters(look="ceramic", color=(0.86, 0.76, 0.58), roughness=0.7),
+    "cream": MaterialParameters(look="ceramic", color=(0.93, 0.89, 0.8), roughness=0.6),
 }
 """Usual looks by material."""
 

@@ -38,6 +38,7 @@ class Laws(NamedTuple):
     slope: Floats  # SAND: of the cone, |s| over 3 p, sqrt(2)/3 tan(phi) [-]
     tip: Floats  # SAND: Hencky strain of volume that cohesion bears [-]
     yielding: Floats  # CLAY: norm of the deviatoric Hencky strain at which it yields [-]
+    flowing: Floats  # CLAY: time in which what is beyond decays, eta/mu [s]
     least: Floats  # SNOW: least and largest stretch [-]
     most: Floats
     hardening: Floats  # SNOW [-]
@@ -146,12 +147,19 @@ def yielded_sand(strain: Vector, b: ti.i32, gained: ti.f32, laws: Laws):
 
 
 @func
-def yielded_clay(strain: Vector, b: ti.i32, laws: Laws) -> Vector:
-    """Hencky strains within von Mises' cylinder (Simo & Hughes 1998, radial return)."""
+def yielded_clay(strain: Vector, b: ti.i32, dt: ti.f32, laws: Laws) -> Vector:
+    """Hencky strains of a Bingham solid after dt [s] (Simo & Hughes 1998, 2.7, implicit).
+
+    What of the deviator is beyond von Mises' cylinder decays, at once without viscosity.
+
+    With |s| = 2 mu |d| and a rate of (|s| - yield)/(2 eta), it becomes 1/(1 + dt mu/eta) of itself.
+    """
     mean = strain.sum() / 3.0
     deviator = strain - mean
     norm = deviator.norm()
-    return Vector(mean) + ti.min(1.0, laws.yielding[b] / ti.max(norm, 1.0e-20)) * deviator
+    beyond = ti.max(norm - laws.yielding[b], 0.0)
+    kept = laws.flowing[b] / (laws.flowing[b] + dt)
+    return strain - (1.0 - kept) * beyond / ti.max(norm, 1.0e-20) * deviator
 
 
 @func
@@ -167,8 +175,8 @@ def hardened(hardening: ti.f32, plastic: ti.f32) -> ti.f32:
 
 
 @func
-def respond(trial: Matrix, b: ti.i32, history: ti.f32, laws: Laws):
-    """What becomes of a trial strain e in a material: the elastic strain e, the Kirchhoff stress [Pa], and the history.
+def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
+    """What becomes of a trial strain e in a step of dt [s]: the elastic strain, the Kirchhoff stress [Pa], the history.
 
     The history is the Hencky strain of volume that sand gained while it was apart, or that snow lost for good.
     """
@@ -185,7 +193,7 @@ def respond(trial: Matrix, b: ti.i32, history: ti.f32, laws: Laws):
         if law == ti.static(int(Law.SAND)):
             after, told = yielded_sand(strain, b, history, laws)
         elif law == ti.static(int(Law.CLAY)):
-            after = yielded_clay(strain, b, laws)
+            after = yielded_clay(strain, b, dt, laws)
         else:
             least, most = 0.5 * log1p(laws.least[b] ** 2 - 1.0), 0.5 * log1p(laws.most[b] ** 2 - 1.0)
             after = ti.min(ti.max(strain, least), most)

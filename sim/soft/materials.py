@@ -16,7 +16,7 @@ class Law(IntEnum):
     ELASTIC = 0  # neo-Hookean
     SAND = 1  # Hencky strains, Drucker-Prager
     SNOW = 2  # fixed corotated, breaks beyond critical stretches, hardens
-    CLAY = 3  # Hencky strains, von Mises
+    CLAY = 3  # Hencky strains, von Mises, flows as a Bingham fluid
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class MaterialRow:
     friction_angle_deg: float | None = None  # SAND [degrees]
     cohesion: float | None = None  # SAND: shear stress that it bears without pressure [Pa]
     yield_stress: float | None = None  # CLAY [Pa]
+    viscosity: float | None = None  # CLAY, beyond its yield stress [Pa s]
     critical_compression: float | None = None  # SNOW: shortening, and
     critical_stretch: float | None = None  # SNOW: lengthening beyond which it breaks [-]
     hardening: float | None = None  # SNOW [-]
@@ -55,8 +56,9 @@ MATERIALS: dict[str, MaterialRow] = {
     ),
     "jelly": MaterialRow(Law.ELASTIC, 1050.0, 1.0e4, 0.45, about="gelatine of 3 % by mass"),
     "rubber": MaterialRow(Law.ELASTIC, 1100.0, 5.0e5, 0.45, about="soft foam of rubber"),
-    "clay": MaterialRow(Law.CLAY, 1700.0, 5.0e5, 0.4, yield_stress=5.0e3, about="potter's clay"),
-    "dough": MaterialRow(Law.CLAY, 1200.0, 2.0e4, 0.4, yield_stress=400.0, about="bread dough"),
+    "clay": MaterialRow(Law.CLAY, 1700.0, 5.0e5, 0.4, yield_stress=5.0e3, viscosity=0.0, about="potter's clay"),
+    "dough": MaterialRow(Law.CLAY, 1200.0, 2.0e4, 0.4, yield_stress=400.0, viscosity=100.0, about="bread dough"),
+    "cream": MaterialRow(Law.CLAY, 500.0, 5.0e3, 0.4, yield_stress=40.0, viscosity=3.0, about="whipped cream"),
 }
 """The materials, by name. Elastic moduli of grains and clays are those of bulk, lowered as far as shapes bear: real
 sand of some 1e7 Pa needs a third of the step."""
@@ -66,6 +68,7 @@ LAW_KEYS: dict[str, Law] = {
     "friction_angle_deg": Law.SAND,
     "cohesion": Law.SAND,
     "yield_stress": Law.CLAY,
+    "viscosity": Law.CLAY,
     "critical_compression": Law.SNOW,
     "critical_stretch": Law.SNOW,
     "hardening": Law.SNOW,

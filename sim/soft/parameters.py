@@ -29,7 +29,7 @@ class SoftParameters(Parameters):
     """A body of soft matter: what it is made of, how finely it is computed, and the volumes that it fills."""
 
     name: BodyName = Field(description="Name of the body, unique in the job.")
-    material: Literal["sand", "wet_sand", "snow", "jelly", "rubber", "clay", "dough"] = Field(
+    material: Literal["sand", "wet_sand", "snow", "jelly", "rubber", "clay", "dough", "cream"] = Field(
         description="What it is made of, which gives the keys below that are omitted: "
         + "; ".join(f"{name}: {row.about}" for name, row in MATERIALS.items())
         + "."
@@ -52,7 +52,10 @@ class SoftParameters(Parameters):
         default=None, description="Shear stress that it bears without pressure, as wet sand does [Pa]; of sand."
     )
     yield_stress: Positive | None = Field(
-        default=None, description="Stress in tension from which on it flows (von Mises) [Pa]; of clay and dough."
+        default=None, description="Stress in tension from which on it flows (von Mises) [Pa]; of clay, dough and cream."
+    )
+    viscosity: NonNegative | None = Field(
+        default=None, description="Viscosity beyond the yield stress (Bingham) [Pa s]; of clay, dough and cream."
     )
     critical_compression: Annotated[float, Field(gt=0.0, lt=0.5)] | None = Field(
         default=None, description="Shortening from which on it is crushed [-]; of snow."

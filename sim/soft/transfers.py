@@ -201,7 +201,7 @@ def grid_to_particles(
         change = dt * affine
         change += 0.5 * change @ change
         b = particles.body[p]
-        strain, stress, history = respond(moved_strain(particles.strain[p], change), b, particles.history[p], laws)
+        strain, stress, history = respond(moved_strain(particles.strain[p], change), b, particles.history[p], dt, laws)
         particles.velocity[p] = velocity
         particles.affine[p] = affine
         particles.strain[p] = strain
@@ -235,12 +235,3 @@ def measure(particles: Particles, laws: Laws, share: Share) -> Results:
         share.tree.partial[lanes + lane] = factor
         share.tree.partial[2 * lanes + lane] = bad
     return reduced_tree(share.tree)
-
-
-@kernel
-def respond_at_rest(particles: Particles, laws: Laws):
-    """Stresses of the strains that particles have."""
-    for p in range(particles.count):
-        if particles.body[p] >= 0:
-            _, stress, _ = respond(particles.strain[p], particles.body[p], particles.history[p], laws)
-            particles.stress[p] = stress

@@ -18,9 +18,9 @@ BLOCK = ({"shape": {"type": "sphere", "radius": 0.1}},)
 
 
 @kernel
-def answer(trial: Matrices, history: Floats, laws: Laws, strain: Matrices, stress: Matrices, told: Floats):
+def answer(trial: Matrices, history: Floats, dt: ti.f32, laws: Laws, strain: Matrices, stress: Matrices, told: Floats):
     for k in range(trial.shape[0]):
-        e, tau, after = respond(trial[k], 0, history[k], laws)
+        e, tau, after = respond(trial[k], 0, history[k], dt, laws)
         strain[k], stress[k], told[k] = e, tau, after
 
 
@@ -55,12 +55,12 @@ def floats(values):
     return array
 
 
-def answered(body, trials, history=0.0):
+def answered(body, trials, history=0.0, dt=1.0e-4):
     """Elastic strain e, Kirchhoff stress and history of trial strains, in float64."""
     n = len(trials)
     before = floats(np.full(n, history))
     out = matrices(np.zeros((n, 3, 3))), matrices(np.zeros((n, 3, 3))), floats(np.zeros(n))
-    answer(matrices(trials), before, laws_of([body]), *out)
+    answer(matrices(trials), before, dt, laws_of([body]), *out)
     return tuple(each.to_numpy().astype(np.float64) for each in out)
 
 
@@ -185,6 +185,19 @@ def test_clay_flows_at_its_yield_stress_in_tension():
         assert mises == pytest.approx(5.0e3, rel=1e-3)
         assert np.linalg.det(np.eye(3) + strain) == pytest.approx(1.0, abs=1e-5)
         assert mean == pytest.approx(0.0, abs=1e-3 * (2.0 * mu + 3.0 * lam) * 0.08)
+
+
+def test_dough_flows_the_faster_the_more_it_is_beyond_its_yield_stress():
+    body, (turn,) = soft("dough"), random_turns(1)
+    mu, _ = body.lame
+    strain, stresses = strains_of([0.05, 0.0, -0.05], turn), []
+    for _ in range(400):
+        (strain,), (stress,), _ = answered(body, [strain], dt=1.0e-4)
+        stresses.append(math.sqrt(1.5) * np.linalg.norm(stress - np.trace(stress) / 3.0 * np.eye(3)))
+    start = 2.0 * mu * 0.05 * math.sqrt(3.0)
+    expected = 400.0 + (start - 400.0) * np.exp(-mu / 100.0 * 1.0e-4 * np.arange(1, 401))
+    np.testing.assert_allclose(stresses, expected, rtol=0.01)
+    assert stresses[-1] < 0.8 * start
 
 
 def test_snow_breaks_beyond_its_stretches_and_is_harder_once_crushed():

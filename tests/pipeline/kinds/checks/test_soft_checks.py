@@ -42,7 +42,7 @@ def test_a_cube_of_jelly_is_fine_and_counted(tmp_path):
             "soft.jelly.young_modulus=1e9",
             "1e+09 Pa need steps of 1.3e-06 s, 13,000 a frame; 4.3e+08 Pa or less would do",
         ),
-        ("soft.jelly.yield_stress=10.0", 'yield_stress is for material = "clay" or "dough"'),
+        ("soft.jelly.yield_stress=10.0", 'yield_stress is for material = "clay" or "dough" or "cream"'),
         ("soft.jelly.poisson_ratio=0.5", "poisson_ratio"),
         ("soft.jelly.block.0.position=[0,0,5]", "has no particle: it is outside the domain"),
     ],
