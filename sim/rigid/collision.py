@@ -201,6 +201,11 @@ class CollisionDetector:
                 put(self._kept.forces, everything)
 
     @property
+    def contact_count(self) -> int:
+        """Of those found last, of all bodies."""
+        return self._total
+
+    @property
     def pair_count(self) -> int:
         """Of pairs that are near, or may get so soon."""
         return len(self._pairs)
