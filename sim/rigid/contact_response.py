@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from sim.core.reductions import runs_on_gpu
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import (
+    COARSE_CONTACTS,
     COARSE_SPEED,
-    COARSE_WORK,
     FEWEST_ITERATIONS,
     MAX_ITERATIONS,
     NO_IMPULSES,
@@ -259,7 +259,7 @@ class ContactResponse:
             WEIGHT_TOLERANCE,
             MAX_ITERATIONS,
             COARSE_SPEED,
-            COARSE_WORK,
+            COARSE_CONTACTS,
             FEWEST_ITERATIONS,
             _rate(dt),
             SLOP,
