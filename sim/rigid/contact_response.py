@@ -136,9 +136,7 @@ class ContactResponse:
             np.zeros((0, 3)),
         )
 
-    def _struck(
-        self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array
-    ) -> Indices:
+    def _struck(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Indices:
         """Rows of the contacts of islands in which something bounces now."""
         none = np.zeros(0, dtype=np.int64)
         if not self._surfaces.restitution.any() or not self._may_bounce(detector, bodies, dt):

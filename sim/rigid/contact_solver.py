@@ -15,8 +15,8 @@ MAX_ITERATIONS = 100
 NO_LINKS, NO_IMPULSES = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
 COARSE_SPEED = 0.05
 COARSE_CONTACTS, FEWEST_ITERATIONS = 2.5, 12
-"""Islands whose contacts are faster [m/s], in the mean, get s sweeps if they have so many contacts times s³, or the least
-number: a heap as many as it is high. What is left of their overlap is far less than they move in the step."""
+"""Islands whose contacts are faster [m/s], in the mean, get s sweeps if they have so many contacts times s³, or the
+least: heaps as many as they are high. What is left of their overlap is far less than they move in the step."""
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 

@@ -33,7 +33,7 @@ def time_to(advance: ti.f64, speed: ti.f64, acceleration: ti.f64) -> ti.f64:
 
 @func
 def may_meet(one: ti.i32, two: ti.i32, bodies: Bodies) -> bool:
-    """Whether the boxes of two bodies overlap with what surfaces may reach, as `CollisionDetector.overlapping` has it."""
+    """Whether boxes overlap with what the bodies' surfaces may reach: see `CollisionDetector.overlapping`."""
     reach = (CONTACT_BAND + TRUSTED_MOTION) * (bodies.size[one] + bodies.size[two])
     reach += bodies.motion[one] + bodies.motion[two]
     may = True

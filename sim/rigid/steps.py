@@ -177,7 +177,8 @@ class StepChooser:
         if not detector.pair_count:
             return True
         fast = np.zeros(1, dtype=np.int32)
-        count_fast(detector.pair_count, near.pairs, moving, detector.walls, self._middle, speeds, dt, acceleration, fast)
+        walls = detector.walls, self._middle
+        count_fast(detector.pair_count, near.pairs, moving, *walls, speeds, dt, acceleration, fast)
         return not fast[0]
 
     def _counts(self, meetings: Meetings, dt: float, is_free: NDArray[np.bool_]) -> tuple[Indices, Indices]:
