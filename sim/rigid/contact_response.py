@@ -14,6 +14,7 @@ from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import (
     COARSE_CONTACTS,
     COARSE_SPEED,
+    COARSE_WORK,
     FEWEST_ITERATIONS,
     MAX_ITERATIONS,
     NO_IMPULSES,
@@ -257,6 +258,7 @@ class ContactResponse:
             WEIGHT_TOLERANCE,
             MAX_ITERATIONS,
             COARSE_SPEED,
+            0 if self.in_colours else COARSE_WORK,  # a sweep in colours takes as long of a small island as of all
             COARSE_CONTACTS,
             FEWEST_ITERATIONS,
             _rate(dt),
