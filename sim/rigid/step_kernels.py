@@ -11,8 +11,8 @@ from sim.rigid.collision_kernels import CONTACT_BAND, FAR, TRUSTED_MOTION, Bodie
 from sim.rigid.contact_kernels import row_of
 
 HEAVIER = 2.0
-"""Bodies push those ahead that are lighter by this factor. Equal ones lose half of their speed, and heaps would look for
-more contacts in every step."""
+"""Bodies push those ahead that are lighter by this factor. Equal ones lose half of their speed, and heaps would look
+for more contacts in every step."""
 
 
 @bundle
