@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sim.core.reductions import runs_on_gpu
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_solver import (
+    COARSE_CONTACTS,
     COARSE_SPEED,
     COARSE_WORK,
     FEWEST_ITERATIONS,
@@ -32,7 +33,7 @@ from sim.rigid.joint_system import JointDemand, solve_alone
 from sim.rigid.joints import Joints, JointStep
 from sim.rigid.parts import PartsDetector
 from sim.rigid.pile import Pile
-from sim.rigid.restitution import Bounces, solve_impacts
+from sim.rigid.restitution import Bounces, slowest_bounce, solve_impacts
 from sim.rigid.states import MovingBodies
 
 SEPARATION_TIME_S, LARGEST_SEPARATION = 0.01, 0.2  # in which overlaps decay, and by what share a step at most
@@ -110,14 +111,85 @@ class ContactResponse:
             return Outcome(np.zeros((n + 1, 6)), nobody, nobody.copy(), None, 0, True, still, np.zeros((0, 3)))
         if self.in_colours is None:
             self.in_colours = runs_on_gpu()
-        if (
-            step is None
-            and carried is None
-            and isinstance(detector, CollisionDetector)
-            and not self._bounce_in(detector)
-        ):
+        if step is not None or carried is not None or not isinstance(detector, CollisionDetector):
+            return self._resolve_some(detector.contacts(), bodies, dt, ease, joints, step, carried)
+        rows = self._struck(detector, bodies, dt, ease)
+        if not len(rows):
             return self._resolve_pile(detector, bodies, dt, ease)
+        contacts, of_others = detector.contacts(), ease.copy()
+        struck = contacts.chosen(rows)
+        if len(rows) == len(contacts):
+            return self._resolve_some(contacts, bodies, dt, ease)
+        for numbers in (struck.first, struck.second):
+            of_others[np.minimum(numbers, n)] = 0.0
+        outcome = self._resolve_some(struck, bodies, dt, ease)
+        others = self._resolve_pile(detector, bodies, dt, of_others)
+        forces = detector.contacts().force.copy()
+        forces[rows] = outcome.forces
+        return Outcome(
+            outcome.extra + others.extra,
+            outcome.is_touched | others.is_touched,
+            outcome.is_held | others.is_held,
+            forces,
+            max(outcome.iterations, others.iterations),
+            outcome.converged and others.converged,
+            NO_IMPULSES,
+            np.zeros((0, 3)),
+        )
+
+    def _struck(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Indices:
+        """Rows of the contacts of islands in which something bounces now."""
+        none = np.zeros(0, dtype=np.int64)
+        if not self._surfaces.restitution.any() or not self._may_bounce(detector, bodies, dt):
+            return none
         contacts = detector.contacts()
+        restitution = self._surfaces.of_pairs(contacts.first, contacts.second)[1]
+        rows = np.flatnonzero(restitution)
+        if not len(rows):
+            return none
+        may, position = contacts.chosen(rows), np.concatenate([bodies.position, np.zeros((1, 3))])
+        pairs = np.minimum(np.stack([may.first, may.second], axis=1), len(bodies)).astype(np.int32)
+        system = ContactSystem(may.point, may.normal, pairs, position, ease, none, none, NO_LINKS)
+        velocity = np.concatenate([np.hstack([bodies.velocity, bodies.angular_velocity]), np.zeros((1, 6))])
+        found = Bounces.find(
+            may,
+            bodies,
+            approach=system.along_normals(velocity),
+            restitution=restitution[rows],
+            gravity=self._gravity,
+            dt=dt,
+        )
+        if not found.happens.any():
+            return none
+        islands = ContactSystem.build(contacts, bodies.position, ease).islands
+        return np.flatnonzero(np.isin(islands, islands[rows[found.happens]]))
+
+    def _may_bounce(self, detector: CollisionDetector, bodies: MovingBodies, dt: float) -> bool:
+        """Whether any contact may bounce: a look from above at what `Bounces` find exactly."""
+        from sim.rigid.step_kernels import count_bouncing
+
+        _, _, on_device, placed = detector.on_device()
+        moving, bouncing = bodies.moving(), np.zeros(1, dtype=np.int32)
+        restitution = np.append(self._surfaces.restitution, 0.0)
+        fall, slowest = dt * self._gravity[None], slowest_bounce(self._gravity, dt)
+        count_bouncing(
+            detector.contact_count, placed, on_device, moving.velocity, moving.angular_velocity, restitution, fall,
+            slowest, dt, bouncing,
+        )  # fmt: skip
+        return bool(bouncing[0])
+
+    def _resolve_some(
+        self,
+        contacts: Contacts,
+        bodies: MovingBodies,
+        dt: float,
+        ease: Array,
+        joints: Joints | None = None,
+        step: JointStep | None = None,
+        carried: Callable[[Contacts], Carried] | None = None,
+    ) -> Outcome:
+        """As `resolve`, of these contacts, whole islands, by the host."""
+        n = len(bodies)
         links = NO_LINKS if step is None else step.system.links()
         led = NOT_CARRIED if carried is None else carried(contacts)
         points = no_points(0) if joints is None else joints.points
@@ -173,13 +245,6 @@ class ContactResponse:
             impacts.impulses + solution.impulses,
         )
 
-    def _bounce_in(self, detector: CollisionDetector) -> bool:
-        """Whether any of the contacts may bounce."""
-        if not self._surfaces.restitution.any():
-            return False
-        contacts = detector.contacts()
-        return bool(self._surfaces.of_pairs(contacts.first, contacts.second)[1].any())
-
     def _resolve_pile(self, detector: CollisionDetector, bodies: MovingBodies, dt: float, ease: Array) -> Outcome:
         from sim.rigid.pile_kernels import Limits
 
@@ -193,7 +258,8 @@ class ContactResponse:
             WEIGHT_TOLERANCE,
             MAX_ITERATIONS,
             COARSE_SPEED,
-            COARSE_WORK,
+            0 if self.in_colours else COARSE_WORK,  # a sweep in colours takes as long of a small island as of all
+            COARSE_CONTACTS,
             FEWEST_ITERATIONS,
             _rate(dt),
             SLOP,

@@ -14,9 +14,10 @@ from sim.rigid.joint_system import JointDemand
 MAX_ITERATIONS = 100
 NO_LINKS, NO_IMPULSES = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
 COARSE_SPEED = 0.05
-COARSE_WORK, FEWEST_ITERATIONS = 15_000, 15
-"""Islands whose contacts are faster [m/s], in the mean, get as many sweeps as make so many looks at contacts, or the
-least: what is left of their overlap is far less than they move in the step."""
+COARSE_WORK, COARSE_CONTACTS, FEWEST_ITERATIONS = 3_000, 2.5, 12
+"""Islands whose contacts are faster [m/s], in the mean, get the most of three numbers of sweeps: what makes so many
+looks at contacts; s, if they have so many contacts times s³, as a heap is high; the least that any gets. What is left
+of their overlap is far less than they move in the step."""
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 
@@ -91,7 +92,8 @@ class ContactSystem:
         speeds = np.sqrt(np.square(velocity[:, :3]).sum(axis=1))[self.bodies]
         speed = np.maximum(speeds[:, 0], speeds[:, 1])
         is_coarse = np.bincount(self.islands, weights=speed) > COARSE_SPEED * sizes
-        fewer = (COARSE_WORK // sizes).clip(FEWEST_ITERATIONS, MAX_ITERATIONS)
+        fewer = np.maximum(COARSE_WORK // sizes, np.ceil(np.cbrt(sizes / COARSE_CONTACTS)))
+        fewer = fewer.clip(FEWEST_ITERATIONS, MAX_ITERATIONS)
         return np.where(is_coarse, fewer, MAX_ITERATIONS).astype(np.int32)
 
     def velocities(self, of_bodies: Array) -> Array:

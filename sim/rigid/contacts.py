@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,10 @@ class Contacts:
 
     def __len__(self) -> int:
         return len(self.gap)
+
+    def chosen(self, rows: Indices) -> Contacts:
+        """Some of them."""
+        return Contacts(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def keys(self) -> Indices:
         """Number that tells a contact apart, (k,), in the order of the pairs."""

@@ -17,7 +17,7 @@ from sim.rigid.contact_solver import FEWEST_ITERATIONS, MAX_ITERATIONS
 from sim.rigid.contacts import Array
 from sim.rigid.tables import kept, larger
 
-LOOKS = (0, FEWEST_ITERATIONS, *range(20, MAX_ITERATIONS + 1, 20))
+LOOKS = (0, *range(FEWEST_ITERATIONS, MAX_ITERATIONS + 1, 4))
 """Sweeps before which the device is asked whether any island is not done."""
 
 

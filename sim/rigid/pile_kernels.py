@@ -89,7 +89,8 @@ class Limits(NamedTuple):
     most: ti.i32  # sweeps
     coarse_speed: ti.f64  # islands that are faster, in the mean, [m/s]
     coarse_work: ti.i32  # get so many looks at contacts
-    fewest: ti.i32  # or at least so many sweeps
+    coarse_contacts: ti.f64  # or s sweeps if they have so many contacts times s³
+    fewest: ti.i32  # or at least so many
     rate: ti.f64  # at which overlaps shrink [1/s]
     slop: ti.f64  # overlap that stays [m]
     dt: ti.f64  # [s]
@@ -195,8 +196,11 @@ def sweeps_worth(island: ti.i32, pile: Pile, limits: Limits) -> ti.i64:
     most = ti.cast(limits.most, ti.i64)
     contacts = pile.islands[island, CONTACTS]
     if pile.islands[island, SPEED] > 1.0e6 * limits.coarse_speed * contacts:
-        fewer = limits.coarse_work // ti.max(contacts, 1)
-        most = ti.max(ti.cast(limits.fewest, ti.i64), ti.min(most, fewer))
+        fewer = ti.cast(ti.max(limits.fewest, limits.coarse_work // ti.max(contacts, 1)), ti.i64)
+        fewer = ti.min(most, fewer)
+        while fewer < most and limits.coarse_contacts * fewer * fewer * fewer < contacts:
+            fewer += 1
+        most = fewer
     return most
 
 

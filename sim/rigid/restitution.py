@@ -52,8 +52,7 @@ class Bounces:
         hits &= time_s <= dt
         time_s = np.where(hits, time_s, 0.0)
         impact = before + acceleration * time_s
-        slowest = max(SLOWEST_BOUNCE, 2.0 * dt * float(np.linalg.norm(gravity)))
-        happens = hits & (restitution > 0.0) & (impact < -slowest)
+        happens = hits & (restitution > 0.0) & (impact < -slowest_bounce(gravity, dt))
         rest = np.where(happens, dt - time_s, 0.0)
         return cls(
             happens=happens,
@@ -85,6 +84,11 @@ class Bounces:
         `share` is that of the restitution: 1 as it is, 0 for the state in which the bodies no longer approach.
         """
         return np.where(self.happens, self.fall - share * self.restitution * self.impact, otherwise)
+
+
+def slowest_bounce(gravity: Array, dt: float) -> float:
+    """Approach below which nothing bounces in a step of dt [s]; gravity is in m/s²."""
+    return max(SLOWEST_BOUNCE, 2.0 * dt * float(np.linalg.norm(gravity)))
 
 
 def solve_impacts(

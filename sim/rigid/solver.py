@@ -186,7 +186,8 @@ class RigidSolver:
         dt = self._largest_dt if spin == 0.0 else min(self._largest_dt, own_steps * LARGEST_TURN / spin)
         if not is_dynamic.any() or self._chooser.needs_none(dt / own_steps):
             return dt
-        meetings = self._chooser.meetings(self.poses(), dt, ~self.bodies.is_asleep)
+        awake = ~self.bodies.is_asleep
+        meetings = self._chooser.meetings(self.poses(), dt, awake, has_own_steps=self.has_own_steps)
         shortest = min(float(np.min(each, initial=np.inf)) for each in (meetings.time_s, meetings.alone_s))
         return min(dt, own_steps * shortest)
 
@@ -248,6 +249,8 @@ class RigidSolver:
         points = None if joints is None else joints.points.state()
         if joints is not None:
             joints.points.push(dt)
+        if isinstance(self._detector, CollisionDetector):
+            reach = self._detector.with_pushes(self._poses_described(), reach, bodies.mass)
         self._detector.find(self._poses_described(), reach, among, time_s)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
         carried = partial(self._carried, time_s=time_s + 0.5 * dt) if self.deforming else None

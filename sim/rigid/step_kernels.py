@@ -1,12 +1,18 @@
-"""Whether bodies that are near each other may get too far in a step."""
+"""How far bodies that are near each other may get in a step, whether that is too far, and whether any may bounce."""
 
 from typing import NamedTuple
 
 import taichi as ti
 
-from sim.core.bundles import bundle
+from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
-from sim.rigid.array_types import Numbers, Rows, Vector3, Whole, WholeRows
+from sim.rigid.array_types import LongRows, Numbers, Rows, Vector3, Whole, WholeRows
+from sim.rigid.collision_kernels import CONTACT_BAND, FAR, TRUSTED_MOTION, Bodies, Placed
+from sim.rigid.contact_kernels import row_of
+
+HEAVIER = 2.0
+"""Bodies push those ahead that are lighter by this factor. Equal ones lose half of their speed, and heaps would look
+for more contacts in every step."""
 
 
 @bundle
@@ -19,6 +25,7 @@ class Speeds(NamedTuple):
     advance: Numbers  # how far surfaces may get in a step [m]
     is_free: Whole
     radius: Numbers  # [m]
+    ball: Numbers  # that of what may bounce off a wall within a step, `FAR` of others [m]
 
 
 @ti.func
@@ -28,12 +35,25 @@ def time_to(advance: ti.f64, speed: ti.f64, acceleration: ti.f64) -> ti.f64:
     return 2.0 * advance / ti.max(root, ti.cast(1.0e-300, ti.f64))
 
 
+@func
+def may_meet(one: ti.i32, two: ti.i32, bodies: Bodies) -> bool:
+    """Whether boxes overlap with what the bodies' surfaces may reach: see `CollisionDetector.overlapping`."""
+    reach = (CONTACT_BAND + TRUSTED_MOTION) * (bodies.size[one] + bodies.size[two])
+    reach += bodies.motion[one] + bodies.motion[two]
+    may = True
+    for axis in ti.static(range(3)):
+        may &= bodies.box[one, axis] - bodies.box[two, 3 + axis] <= reach
+        may &= bodies.box[two, axis] - bodies.box[one, 3 + axis] <= reach
+    return may
+
+
 @kernel_of_host_arrays
 def count_fast(
     count: ti.i32,
     pairs: WholeRows,
-    pose: Rows,
+    bodies: Bodies,
     walls: Rows,
+    middle: Numbers,
     speeds: Speeds,
     dt: ti.f64,
     acceleration: ti.f64,
@@ -41,7 +61,8 @@ def count_fast(
 ):
     """Count in `fast` those of so many pairs, of which one is free at least, that may get too far in dt [s].
 
-    Pairs are those of `collision_kernels.Near`, walls those of `find_contacts`.
+    Pairs are those of `collision_kernels.Near`, walls those of `find_contacts`, with the way from each to the middle
+    between it and the one that faces it [m].
     """
     for pair in range(count):
         one, two, wall = pairs[pair, 0], pairs[pair, 1], pairs[pair, 2]
@@ -50,9 +71,9 @@ def count_fast(
             if wall >= 0:
                 for axis in ti.static(range(3)):
                     if ti.cast(walls[wall, 0], ti.i32) == axis:
-                        height = walls[wall, 1] * (pose[one, axis] - walls[wall, 2])
+                        height = walls[wall, 1] * (bodies.pose[one, axis] - walls[wall, 2])
                         relative += ti.abs(speeds.velocity[one, axis])
-                        advance = ti.max(advance, 0.5 * (height - speeds.radius[one]))
+                        advance = ti.max(advance, 0.5 * (height - speeds.radius[one]), middle[wall] - speeds.ball[one])
             else:
                 slower, faster = ti.min(speeds.own[one], speeds.own[two]), ti.max(speeds.own[one], speeds.own[two])
                 advance = ti.min(advance, speeds.advance[two])
@@ -62,5 +83,89 @@ def count_fast(
                 for axis in ti.static(range(3)):
                     apart[axis] = speeds.velocity[one, axis] - speeds.velocity[two, axis]
                 relative += apart.norm()
-            if time_to(advance, relative, acceleration) < dt:
+            if time_to(advance, relative, acceleration) < dt and (wall >= 0 or may_meet(one, two, bodies)):
                 fast[0] += 1
+
+
+@kernel_of_host_arrays
+def hand_on(
+    count: ti.i32,
+    pairs: WholeRows,
+    bodies: Bodies,
+    mass: Numbers,
+    motion: Numbers,
+    behind: Numbers,
+    most: LongRows,
+    changed: Whole,
+):
+    """How far the surfaces of the two bodies of each of so many pairs may get if one is pushed by the other.
+
+    A body that hits a lighter one, which sticks to it, shares its momentum. Whole numbers are compared, so that the
+    order of threads does not matter.
+
+    Args:
+        mass: of those that move, however large of those that are led [kg], (n,).
+        motion: how far surfaces may get in the step [m], (b,), and with the push.
+        behind: largest mass that pushes each, its own at first [kg], (n,), and with the push.
+        most: room: both as bits, (n, 2).
+        changed: how many there are that get farther.
+    """
+    for body in range(mass.shape[0]):
+        most[body, 0], most[body, 1] = ti.bit_cast(motion[body], ti.i64), ti.bit_cast(behind[body], ti.i64)
+    for pair in range(count):
+        for side in ti.static(range(2)):
+            one, two = pairs[pair, side], pairs[pair, 1 - side]
+            if pairs[pair, 2] < 0 and ti.max(one, two) < mass.shape[0]:
+                is_heavy = behind[one] >= HEAVIER * mass[two]
+                pushed = motion[one] * behind[one] / (behind[one] + mass[two])
+                if is_heavy and pushed > motion[two] + CONTACT_BAND * bodies.size[two]:
+                    apart = -ti.cast(FAR, ti.f64)
+                    for axis in ti.static(range(3)):
+                        apart = ti.max(apart, bodies.box[one, axis] - bodies.box[two, 3 + axis])
+                        apart = ti.max(apart, bodies.box[two, axis] - bodies.box[one, 3 + axis])
+                    if apart <= motion[one] + motion[two]:
+                        ti.atomic_max(most[two, 0], ti.bit_cast(pushed, ti.i64))
+                        ti.atomic_max(most[two, 1], ti.bit_cast(behind[one], ti.i64))
+                        changed[0] += 1
+    for body in range(mass.shape[0]):
+        motion[body], behind[body] = ti.bit_cast(most[body, 0], ti.f64), ti.bit_cast(most[body, 1], ti.f64)
+
+
+@kernel_of_host_arrays
+def count_bouncing(
+    count: ti.i32,
+    placed: Placed,
+    bodies: Bodies,
+    velocity: Rows,
+    angular_velocity: Rows,
+    restitution: Numbers,
+    fall: Rows,
+    slowest: ti.f64,
+    dt: ti.f64,
+    bouncing: Whole,
+):
+    """Count in `bouncing` those of so many contacts that `restitution.Bounces` may find to bounce in dt [s].
+
+    Args:
+        velocity: of the moving bodies, with all of the step's gravity [m/s], (n, 3).
+        angular_velocity: [rad/s], (n, 3).
+        restitution: of all bodies, and 0 for the domain, (b,).
+        fall: what gravity added to velocities [m/s], (1, 3).
+        slowest: approach below which nothing bounces [m/s].
+    """
+    for contact in range(count):
+        one, two = placed.bodies[contact, 0], placed.bodies[contact, 1]
+        if restitution[one] > 0.0 or restitution[two] > 0.0:
+            normal = row_of(placed.normal, contact)
+            approach, before = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+            for side in ti.static(range(2)):
+                body = one if ti.static(side == 0) else two
+                if body < velocity.shape[0]:
+                    arm = row_of(placed.point, contact) - row_of(bodies.pose, body)
+                    own = ti.static(1.0 - 2.0 * side) * normal
+                    along = own.dot(row_of(velocity, body) + row_of(angular_velocity, body).cross(arm))
+                    approach += along
+                    before += along - own.dot(row_of(fall, 0))
+            least = ti.min(approach, before)
+            if least < -slowest and placed.gap[contact] <= -1.001 * least * dt:
+                bouncing[0] += 1

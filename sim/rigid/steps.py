@@ -17,6 +17,7 @@ from sim.rigid.contacts import Array, Indices
 from sim.rigid.parts import PartsDetector
 from sim.rigid.states import MovingBodies, lengths
 from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.primitives import Sphere
 
 LARGEST_ADVANCE = 0.25
 """How far surfaces may get in a step, in half shortest edges of the smaller dynamic body of two that may meet; a body
@@ -59,10 +60,27 @@ class StepChooser:
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
         self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
+        is_ball = [
+            isinstance(each.solid.shape, Sphere) and np.abs(each.centre_of_mass).max() < 1.0e-9 * each.radius
+            for each in geometries
+        ]
+        self._ball = np.where(is_ball, 0.5 * self._edge, FAR)  # radii of what may bounce within a step
+        self._middle = np.array([_half_way(wall, walls) for wall in walls] or [FAR])
         self.links = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
-    def meetings(self, poses: Poses, dt: float, is_active: NDArray[np.bool_], speeds: Array | None = None) -> Meetings:
-        """The meetings of active bodies, (n,), within dt [s]; speeds of surfaces [m/s], (n,), their own if omitted."""
+    def meetings(
+        self,
+        poses: Poses,
+        dt: float,
+        is_active: NDArray[np.bool_],
+        speeds: Array | None = None,
+        *,
+        has_own_steps: bool = True,
+    ) -> Meetings:
+        """The meetings of active bodies, (n,), within dt [s]; speeds of surfaces [m/s], (n,), their own if omitted.
+
+        Where nobody has steps of their own balls do not bounce within a step either: it is shared by what they push.
+        """
         bodies, n = self._bodies, len(self._bodies)
         acceleration = float(np.linalg.norm(self._gravity))
         spin = bodies.spins()
@@ -86,13 +104,15 @@ class StepChooser:
         time_s[fast] = time_of(np.maximum(advance[fast], 0.5 * room), relative[fast], acceleration)
 
         alone_s = np.divide(LARGEST_TURN, spin, out=np.full(n, np.inf), where=spin > 0.0)
-        for wall in self._walls:
+        for wall, middle in zip(self._walls, self._middle, strict=False):
             height = wall.side * (bodies.position[:, wall.axis] - wall.offset)
             along = np.delete(bodies.position, wall.axis, axis=1)
             aside = np.maximum(wall.lower - along, along - wall.upper).max(axis=1)
             # Who left by an open face falls on, past the edges of the wall.
             meets = bodies.is_dynamic & (height > 0.0) & (aside <= self._radius[:n] + motion[:n])
             advance = np.maximum(self._advance[:n], 0.5 * (height - self._radius[:n]))
+            if has_own_steps:
+                advance = np.maximum(advance, middle - self._ball[:n])
             # Along a plane it may get as far as it likes.
             towards = np.abs(bodies.velocity[:, wall.axis]) + spin * self._radius[:n] + bodies.deforming
             by_wall = time_of(advance, towards, acceleration)
@@ -151,12 +171,14 @@ class StepChooser:
             np.append(self._advance, FAR),
             np.append(is_free, np.zeros(still)).astype(np.int32),
             np.append(self._radius, 0.0),
+            np.append(self._ball, FAR),
         )
         near, _, moving, _ = detector.on_device()
         if not detector.pair_count:
             return True
         fast = np.zeros(1, dtype=np.int32)
-        count_fast(detector.pair_count, near.pairs, moving.pose, detector.walls, speeds, dt, acceleration, fast)
+        walls = detector.walls, self._middle
+        count_fast(detector.pair_count, near.pairs, moving, *walls, speeds, dt, acceleration, fast)
         return not fast[0]
 
     def _counts(self, meetings: Meetings, dt: float, is_free: NDArray[np.bool_]) -> tuple[Indices, Indices]:
@@ -188,6 +210,12 @@ class StepChooser:
                 room[mine] = geometry.signed_distance(away[mine] @ poses.rotation[number])
         result: Array = room - self._radius[first]
         return result
+
+
+def _half_way(wall: Wall, walls: Sequence[Wall]) -> float:
+    """Half of the way from a wall to the one that faces it [m], however far that is."""
+    facing = (abs(each.offset - wall.offset) for each in walls if (each.axis, each.side) == (wall.axis, -wall.side))
+    return 0.5 * next(facing, 2.0 * FAR)
 
 
 def groups_of(first: Indices, second: Indices, count: int) -> Indices:

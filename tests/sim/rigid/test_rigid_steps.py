@@ -38,6 +38,23 @@ def test_a_fast_body_elsewhere_takes_steps_of_its_own_and_changes_not_a_bit_of_t
     assert together.bodies.velocity[-1, 2] == pytest.approx(120.0, rel=0.05)
 
 
+def test_a_fast_ball_bounces_between_walls_without_steps_of_its_own():
+    """It passes a quarter of its radius in a 26th of a step."""
+    ball_between = body("ball", ball(0.02), (0.0, 0.1, 2.0), velocity=(0.0, 70.0, 0.0), friction=0.0, restitution=1.0)
+    still = body("still", cube(0.2), (1.0, 0.0, 0.1))
+    domain = DomainParameters(min=(-2.0, -0.5, 0.0), max=(2.0, 0.5, 4.0))
+    solver = RigidSolver([still, ball_between], domain=domain, gravity=(0.0, 0.0, 0.0))
+    solver.has_own_steps = True
+    room, dt = 1.0 - 2.0 * 0.02, 1.0 / 540.0
+    for step in range(1, 101):
+        awake = ~solver.bodies.is_asleep
+        assert [count for count, _ in solver._chooser.divided(solver.poses(), dt, awake)] == [1]
+        solver.substep(dt)
+        way = (0.1 + 0.5 * room + 70.0 * step * dt) % (2.0 * room)
+        assert solver.bodies.position[1, 1] == pytest.approx(min(way, 2.0 * room - way) - 0.5 * room, abs=1e-6)
+    assert abs(solver.bodies.velocity[1, 1]) == pytest.approx(70.0, rel=1e-9)
+
+
 def test_the_step_of_all_is_that_of_a_stack_however_fast_a_body_is():
     near = body("bullet", ball(0.01), (0.0, 0.0, 0.02), velocity=(100.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 900.0))
     solver = in_room(near)
