@@ -36,6 +36,18 @@ class Window:
     first: Index3  # its lowest cell, counted from that of the box; negative where the box has no end
     cells: Index3  # how many along x, y, z
 
+    @classmethod
+    def around(cls, box: NDArray[np.float64], parameters: SmokeParameters, domain: DomainParameters) -> Window:
+        """The cells around a box between two corners [m], (2, 3), as far as the smoke can be there."""
+        corner, counts = np.asarray(parameters.min or domain.min), parameters.cell_counts(domain)
+        limits = np.array(parameters.limits(domain))
+        first, last = np.where(np.isinf(limits), limits, [(0, 0, 0), np.subtract(counts, 1)])
+        low = np.clip(np.floor((box[0] - corner) / parameters.cell_size) - 1, first, last)
+        high = np.clip(np.ceil((box[1] - corner) / parameters.cell_size), low, last)
+        a, b, c = (int(n) for n in low)
+        x, y, z = (int(n) for n in high - low + 1)
+        return cls((a, b, c), (x, y, z))
+
     def inner_faces(self, box: Index3) -> frozenset[Face]:
         """Its sides that are not sides of a box of so many cells."""
         faces: tuple[tuple[Face, Face], ...] = (("x-", "x+"), ("y-", "y+"), ("z-", "z+"))
@@ -126,7 +138,8 @@ class SmokeGrid:
     ) -> SmokeGrid:
         """A box of so many cells, without solids."""
         corners = tuple(n + 1 for n in cells)
-        return cls(origin, cell_size, cells, open_faces, np.full(corners, FAR, np.float32), inflow_faces)
+        far = np.broadcast_to(np.float32(FAR), corners)  # which takes no memory
+        return cls(origin, cell_size, cells, open_faces, far, inflow_faces)
 
     def with_solids(self, solids: Sequence[HasSignedDistance]) -> SmokeGrid:
         """The same box with these solids in it as well."""

@@ -234,6 +234,15 @@ class SmokeParameters(Parameters):
         x, y, z = (b if end - b < WHOLE * self.cell_size else end for b, end in zip(high, ends, strict=True))
         return low, (x, y, z)
 
+    def limits(self, domain: DomainParameters) -> tuple[Vector3, Vector3]:
+        """Lower and upper corner of where it can be [m]: of its box, but without end at open sides of an open grid."""
+        low, high = self.corners(domain)
+        if self.grid != "open":
+            return low, high
+        a, b, c = (-math.inf if f"{n}-" in self.open_faces else end for n, end in zip("xyz", low, strict=True))
+        d, e, f = (math.inf if f"{n}+" in self.open_faces else end for n, end in zip("xyz", high, strict=True))
+        return (a, b, c), (d, e, f)
+
     def cell_counts(self, domain: DomainParameters) -> tuple[int, int, int]:
         """How many cells its box has along x, y, z; 1 where it has no length."""
         low, high = self.min or domain.min, self.max or domain.max

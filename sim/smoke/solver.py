@@ -1,6 +1,7 @@
 """Hot smoke on a staggered grid (Fedkiw, Stam & Jensen 2001)."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import taichi as ti
@@ -13,7 +14,7 @@ from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
 from sim.core.snapshots import Snapshot
-from sim.core.solver import Arrays, Diagnostics, Remedies
+from sim.core.solver import Arrays, Diagnostics, OutgrownError, Remedies
 from sim.forces.field import ForceField
 from sim.shapes.solid import HasSignedDistance
 from sim.smoke.advection import Advection
@@ -23,8 +24,8 @@ from sim.smoke.forces import accelerate, cool, upward
 from sim.smoke.grid import Index3, SmokeGrid, Window
 from sim.smoke.lanes import lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air, AirForce, Obstacles, time_of_travel
-from sim.smoke.outer_forces import OuterForces
-from sim.smoke.parameters import SmokeParameters
+from sim.smoke.outer_forces import OuterForces, OutsideAir
+from sim.smoke.parameters import MOST_CELLS, SmokeParameters
 from sim.smoke.projection import PressureProjection, ProjectionReport
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 from sim.smoke.sides import blow_in, brake_inflow, start_wind
@@ -65,8 +66,10 @@ class SmokeSolver:
         time_s: simulated time [s].
         air_forces: what pushes the air from outside, in this order in every substep.
         sources: where smoke comes from, in the order of the parameters.
+        refusal: of more cells (`Grows`).
 
     Raises:
+        OutgrownError: at the start of a frame, there is no memory for the window that it needs.
         ValueError: the box is empty or full of solids, a source contains no open cell, or solids shut air in that
             wind blows into.
     """
@@ -90,9 +93,11 @@ class SmokeSolver:
         self.parameters = parameters
         self.sources = sources_of(parameters)
         self.air_forces: list[AirForce] = []
+        self.refusal: Callable[[float], str | None] | None = None
         self._gravity, self._has_gravity = gravity, any(upward(gravity))
         self._lift = parameters.lift_per_kelvin(gravity)
         self._domain, self._solids, self._outer = domain, solids, (forces or ForceField(())).on([(self.name,)])
+        self._outside = OutsideAir(parameters.wind, self._outer)
         self._frame_s, self._fitting = frame_s, Fitting(parameters, domain, frame_s)
         window = self._fitting.first(source.bounds(0.0, 0.0) for source in self.sources)
         self.grid = SmokeGrid.build(parameters, domain, solids, window)
@@ -126,7 +131,6 @@ class SmokeSolver:
             self.air,
             work,
             maccormack=parameters.advection == "maccormack",
-            wind=parameters.wind,
         )
         self._transport = Transport(self.air, work, sharpens=parameters.advection == "maccormack")
         self._open_sides = self.grid.open_sides
@@ -144,6 +148,7 @@ class SmokeSolver:
         """Compute in another window from now on: what it shares with the present one stays, else there is fresh air."""
         if window == self.grid.window:
             return
+        self._require_room(window)
         state, grid, box, moving = self.state, self.grid, self.obstacles.box, self.obstacles.moving
         movers = self.obstacles.movers
         self.air_forces.clear()
@@ -155,13 +160,23 @@ class SmokeSolver:
         self.obstacles = Obstacles(self.grid, moving=moving)
         self.obstacles.movers += movers
         self._compute_in_grid()
-        if any(self.parameters.wind):
-            start_wind(self.air, self.parameters.wind, self.parameters.windward_faces)
+        if any(self._outside.velocity):
+            start_wind(self.air, self._outside.velocity, self.parameters.windward_faces)
         carry_over(state, (grid, box), self.state, (self.grid, self.obstacles.box))
         for mover in movers:
             mover.exchange(0.0)
         self.move_obstacles()
         self._extrapolation.fill()
+
+    def _require_room(self, window: Window) -> None:
+        before, cells = math.prod(self.grid.cells), math.prod(window.cells)
+        reason = self.refusal(float(cells - before)) if self.refusal is not None and cells > before else None
+        if cells > MOST_CELLS:
+            reason = f"a smoke may have {MOST_CELLS:,} at most"
+        if reason is not None:
+            raise OutgrownError(
+                f'smoke "{self.name}" grows at {self.time_s:.4g} s from {before:,} to {cells:,} cells: {reason}'
+            )
 
     @property
     def _arrays(self) -> dict[str, ti.Ndarray]:
@@ -188,13 +203,13 @@ class SmokeSolver:
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]; where obstacles are at its end has been marked."""
-        self._advection.advance(dt)
+        self._advection.advance(dt, self._outside.velocity)
         self.move_obstacles()
         self._accelerate(dt)
-        blow_in(self.air, self.parameters.wind, self.parameters.windward_faces)
+        blow_in(self.air, self._outside.velocity, self.parameters.windward_faces)
         self._emit(dt)
         operator, step = self._projection.multigrid.coefficients.operator, dt / self.grid.cell_size
-        brake_inflow(self.air, operator, self._open_sides, self.grid.cells, step)
+        brake_inflow(self.air, operator, self._open_sides, self.grid.cells, self._outside.velocity, step)
         self._projections.append(self._projection.project())
         self._transport.advance(step)
         cool(self.air, self.parameters, dt)
@@ -213,7 +228,9 @@ class SmokeSolver:
         if self._fitting.follows:
             frame = time_s, time_s + self._frame_s
             emitting = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
-            self._move_window(self._fitting.next(self.grid.window, self.air, emitting, self._rows))
+            self._move_window(
+                self._fitting.next(self.air, self.grid.window, self._outside.velocity, emitting, self._rows)
+            )
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Density, temperature and velocity at cell centres; solid cells hold no smoke."""
@@ -250,7 +267,8 @@ class SmokeSolver:
         arrays = {name: values.to_numpy().reshape(self.grid.padded) for name, values in self._arrays.items()}
         clock = np.array([self.time_s, self._emitted_mass])
         window = {"window": np.array([self.grid.first, self.grid.cells])} if self._fitting.follows else {}
-        return {**arrays, **self.obstacles.checkpoint(), **window, "clock": clock}
+        outside = {"outside": np.array(self._outside.velocity)} if self._outer.blows else {}
+        return {**arrays, **self.obstacles.checkpoint(), **window, **outside, "clock": clock}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -263,6 +281,7 @@ class SmokeSolver:
             self._move_window(Window(first, cells))
         moving = ["obstacles"] if self.obstacles.moving else []
         expected = {**dict.fromkeys([*self._arrays, *moving], self.grid.padded), "clock": (2,)}
+        expected |= {"outside": (3,)} if self._outer.blows else {}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
@@ -273,6 +292,9 @@ class SmokeSolver:
             self.obstacles.restore(arrays["obstacles"])
             self._follow_obstacles()
         self.time_s, self._emitted_mass = arrays["clock"].tolist()
+        if self._outer.blows:
+            x, y, z = arrays["outside"].tolist()
+            self._outside.velocity = x, y, z
 
     def diagnostics(self) -> Diagnostics:
         """Totals of the state, and the projections of the frame.
@@ -322,6 +344,7 @@ class SmokeSolver:
             self._turbulence.accelerate(self.air, self.time_s + 0.5 * dt, dt)
         for force in self.air_forces:
             force.accelerate(dt)
+        self._outside.advance(dt)
 
     def _emit(self, dt: float) -> None:
         for source in self.sources:

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats
 from sim.core.bundles import func
-from sim.core.domain import DomainParameters, Face
+from sim.core.domain import DomainParameters
 from sim.core.launch import kernel
+from sim.core.parameters import Vector3
 from sim.smoke.grid import Index3, SmokeGrid, Window
 from sim.smoke.lanes import Grid, cell_counts, lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air
@@ -58,27 +59,23 @@ class Fitting:
         self.follows = parameters.grid != "box"
         self._parameters, self._frame_s = parameters, frame_s
         self._corner = np.asarray(parameters.min or domain.min)
-        self._ends = np.array([(0, 0, 0), parameters.cell_counts(domain)], float)
-        if parameters.grid == "open":
-            for axis, name in enumerate("xyz"):
-                for side, (sign, end) in enumerate((("-", -np.inf), ("+", np.inf))):
-                    face: Face = f"{name}{sign}"  # type: ignore[assignment]
-                    if face in parameters.open_faces:
-                        self._ends[side, axis] = end
+        limits = np.array(parameters.limits(domain))
+        self._ends = np.where(np.isinf(limits), limits, [(0, 0, 0), parameters.cell_counts(domain)])
 
     def first(self, sources: Iterable[Ends]) -> Window | None:
         """The window to start with, around all sources, each between two corners [m]; None for the whole box."""
         ends = self._in_cells(sources)
         return None if ends is None or not self.follows else self._fitted(ends)
 
-    def next(self, window: Window, air: Air, sources: Iterable[Ends], rows: Rows) -> Window:
+    def next(self, air: Air, window: Window, wind: Vector3, sources: Iterable[Ends], rows: Rows) -> Window:
         """The window of the coming frame: the present one, unless that is too small or much too large.
 
-        Sources are those that emit in it, each between the corners of where it does [m]; where neither they nor
+        Air outside has the velocity of a wind [m/s]. Sources are those that emit in the frame, each between the corners
+        of where it does [m]; where neither they nor
         anything else is left, the middle of the window is.
         """
         emitting = self._in_cells(sources)
-        soon, later = (_union(emitting, self._busy(window, air, frames, rows)) for frames in (1.0, FRAMES_AHEAD))
+        soon, later = (_union(emitting, self._busy(air, window, wind, frames, rows)) for frames in (1.0, FRAMES_AHEAD))
         low, high = np.asarray(window.first), np.asarray(window.first) + window.cells
         nothing = np.stack([0.5 * (low + high)] * 2)
         fitted = self._fitted(nothing if later is None else later)
@@ -93,9 +90,9 @@ class Fitting:
             ends = _union(ends, (np.asarray(box) - self._corner) / self._parameters.cell_size)
         return ends
 
-    def _busy(self, window: Window, air: Air, frames: float, rows: Rows) -> Ends | None:
+    def _busy(self, air: Air, window: Window, outside: Vector3, frames: float, rows: Rows) -> Ends | None:
         """Where what is in a window will be busy in so many frames."""
-        wind, step = ti.math.vec3(self._parameters.wind), self._frame_s / self._parameters.cell_size
+        wind, step = ti.math.vec3(outside), self._frame_s / self._parameters.cell_size
         fastest = _find_motion(air, wind, rows)[0]
         least = max(LEAST_MOTION * fastest, CREEP / step)
         ends = np.zeros((2, 3))

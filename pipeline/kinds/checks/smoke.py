@@ -2,14 +2,14 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.closed_domain import check_closed_domain
-from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.checks.memory_budget import MemoryBudget, memory_budget
 from pipeline.kinds.checks.smoke_bodies import (
     LEAST_LAYERS,
     GeometryBuilder,
@@ -18,6 +18,7 @@ from pipeline.kinds.checks.smoke_bodies import (
     geometry_builder,
     static_bodies,
 )
+from pipeline.kinds.sizes import expected_cells
 from pipeline.model.amounts import count, gigabytes, rounded_down, rounded_up
 from pipeline.model.boxes import ALL, Box, overlap, smoke_box, span, touch
 from pipeline.model.job import Job
@@ -138,6 +139,9 @@ def _check_size(
     layers = np.ceil(extent / smoke.cell_size)
     cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, on_gpu=budget.on_gpu)
     cells_before, bytes_before = before
+    if smoke.grid != "box":
+        # Nobody knows how large its window gets: the job pauses should it outgrow the memory.
+        return int(expected_cells(smoke, job.domain)), min(size_bytes, max(0.0, budget.bytes - bytes_before))
     if size_bytes + bytes_before > budget.bytes:
         room = max(0.0, budget.bytes - bytes_before)
         size = _cell_size_that_fits(extent, smoke.cell_size, room, on_gpu=budget.on_gpu)
@@ -165,6 +169,17 @@ def _bytes_of(layers: NDArray[np.float64], *, on_gpu: bool) -> float:
     return cells * BYTES_PER_CELL_ON_GPU + rows * BYTES_PER_ROW_ON_GPU if on_gpu else cells * BYTES_PER_CELL
 
 
+def growth_refusal(job: Job) -> Callable[[float], str | None]:
+    """A function that says why there is no memory, then, for so many more cells of smoke; None if there is."""
+
+    def refusal(more: float) -> str | None:
+        budget = memory_budget(job)
+        each = BYTES_PER_CELL_ON_GPU if budget.on_gpu else BYTES_PER_CELL
+        return budget.refusal(more, "more", float(each))
+
+    return refusal
+
+
 def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: float, *, on_gpu: bool) -> float:
     """The smallest cell size [m], not below a given one, that cuts a box into cells of so many bytes, or into one."""
     most = max(1.0, room // (BYTES_PER_CELL_ON_GPU if on_gpu else BYTES_PER_CELL))
@@ -181,6 +196,8 @@ def _check_wind(job: Job, smoke: SmokeParameters, path: KeyPath, standing: Seque
     """Note wind that has no way out of the box, or past static bodies; the latter in small grids only."""
     if problem := smoke.wind_problem():
         findings.error((*path, "wind"), problem)
+        return
+    if smoke.grid == "open":
         return
     low, high = smoke_box(smoke, job.domain)
     is_too_large = math.prod(np.ceil((high - low) / smoke.cell_size).tolist()) > COUNTED_CELLS
@@ -271,7 +288,7 @@ def _check_place(job: Job, path: KeyPath, solids: Solids, standing: Sequence[Sol
     smoke, solid = job.smoke[int(path[1])], solids[path]
     source = smoke.source[int(path[3])]
     body = next((each for each in job.rigid if each.name == source.follow), None)
-    box = smoke_box(smoke, job.domain)
+    box = np.array(smoke.limits(job.domain))
     if body is not None and body.kind == "dynamic":
         pass  # nobody knows where it gets
     elif source.keyframe or (body is not None and body.kind == "kinematic"):
@@ -286,14 +303,14 @@ def _check_place(job: Job, path: KeyPath, solids: Solids, standing: Sequence[Sol
 def _check_source(job: Job, path: KeyPath, solid: Solid, standing: Sequence[Solid], findings: Findings) -> None:
     """A source that stays must be in the box and have cells of its own."""
     smoke = job.smoke[int(path[1])]
-    box, cell_size = smoke_box(smoke, job.domain), smoke.cell_size
+    box, cell_size = np.array(smoke.limits(job.domain)), smoke.cell_size
     inside = overlap(solid.bounds, box)
     if inside == 0.0:
         findings.error(path, f"is wholly outside the smoke's grid: it spans {span(solid.bounds)}, not {span(box)}")
         return
     if inside < ALL:
         findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
-    centres = _centres_inside(solid, box, cell_size)
+    centres = _centres_inside(solid, box, smoke_box(smoke, job.domain)[0], cell_size)
     if centres is not None and len(centres) == 0:
         thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
         findings.error(
@@ -309,17 +326,20 @@ def _check_source(job: Job, path: KeyPath, solid: Solid, standing: Sequence[Soli
             findings.error(path, "lies wholly inside solid bodies, so it emits nothing; move it")
 
 
-def _centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:
-    """Centres of cells that a solid contains [m], (n, 3); None if there are too many cells around it."""
+def _centres_inside(
+    solid: Solid, box: Box, corner: NDArray[np.float64], cell_size: float
+) -> NDArray[np.float64] | None:
+    """Centres of cells in a box that a solid contains [m], (n, 3); None if there are too many cells around it.
+
+    Some cell has a corner at `corner` [m].
+    """
     low = np.maximum(solid.bounds[0], box[0])
     high = np.minimum(solid.bounds[1], box[1])
-    first = np.ceil((low - box[0]) / cell_size - 0.5)
-    last = np.floor((high - box[0]) / cell_size - 0.5)
+    first = np.ceil((low - corner) / cell_size - 0.5)
+    last = np.floor((high - corner) / cell_size - 0.5)
     if np.prod(np.maximum(last - first + 1.0, 0.0)) > COUNTED_CELLS:
         return None
-    axes = [
-        corner + (np.arange(a, b + 1.0) + 0.5) * cell_size for corner, a, b in zip(box[0], first, last, strict=True)
-    ]
+    axes = [start + (np.arange(a, b + 1.0) + 0.5) * cell_size for start, a, b in zip(corner, first, last, strict=True)]
     centres: NDArray[np.float64] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside: NDArray[np.float64] = centres[solid.signed_distance(centres) < 0.0] if len(centres) else centres
     return inside

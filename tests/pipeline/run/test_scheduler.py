@@ -264,7 +264,8 @@ def test_random_events_never_break_an_invariant(jobs, seed, faults, ending):
         task_id = chance.choice(sorted(running))
         if chance.random() < faults:
             del running[task_id]
-            kinds = [kind for kind in FailureKind if kind is not FailureKind.DISK_FULL or chance.random() < 0.1]
+            pauses = {FailureKind.DISK_FULL, FailureKind.OUTGROWN}
+            kinds = [kind for kind in FailureKind if kind not in pauses or chance.random() < 0.1]
             instructions = fail(scheduler, task_id, chance.choice(kinds), now)
         elif running[task_id] and chance.random() < 0.2 and len(running[task_id]) == len(by_id[task_id].outputs):
             committed.update(running.pop(task_id))
