@@ -152,6 +152,18 @@ class SmokeGrid:
             distance[spans] = np.minimum(distance[spans], scaled.astype(np.float32))
         return replace(self, distance=distance)
 
+    def with_solids_of(self, others: Sequence[SmokeGrid]) -> SmokeGrid:
+        """The same cells with the solids of other windows of the box in them as well."""
+        distance = self.distance
+        for other in others:
+            shift = np.subtract(other.first, self.first)
+            low, high = np.maximum(0, shift), np.minimum(distance.shape, shift + other.distance.shape)
+            if np.all(low < high):
+                distance = distance.copy() if distance is self.distance else distance
+                own, theirs = tuple(map(slice, low, high)), tuple(map(slice, low - shift, high - shift))
+                distance[own] = np.minimum(distance[own], other.distance[theirs])
+        return replace(self, distance=distance)
+
     def misses(self, region: HasSignedDistance) -> bool:
         """Whether a region that reaches into the box is thinner than a cell, and holds no corner of one."""
         lower, upper = region.bounds

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import numpy as np
 import taichi as ti
@@ -155,8 +156,7 @@ class SmokeSolver:
         # All but the state is given up before there is more.
         del self._projection, self._advection, self._transport, self._extrapolation, self._turbulence, self._rows
         del self.air, self.obstacles
-        empty = SmokeGrid.of_box(self.parameters, self._domain, window)
-        self.grid = empty.with_solids(self._solids) if self._solids else empty
+        self.grid = SmokeGrid.of_box(self.parameters, self._domain, window).with_solids_of(self._cells_of_solids)
         self.obstacles = Obstacles(self.grid, moving=moving)
         self.obstacles.movers += movers
         self._compute_in_grid()
@@ -167,6 +167,15 @@ class SmokeSolver:
             mover.exchange(0.0)
         self.move_obstacles()
         self._extrapolation.fill()
+
+    @cached_property
+    def _cells_of_solids(self) -> list[SmokeGrid]:
+        """The cells around each static solid, wherever it is: distances of meshes are dear, and found once."""
+        windows = [Window.around(solid.bounds, self.parameters, self._domain) for solid in self._solids]
+        return [
+            SmokeGrid.of_box(self.parameters, self._domain, window).with_solids([solid])
+            for window, solid in zip(windows, self._solids, strict=True)
+        ]
 
     def _require_room(self, window: Window) -> None:
         before, cells = math.prod(self.grid.cells), math.prod(window.cells)
