@@ -60,6 +60,8 @@ def check_smokes(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
     for index, smoke in enumerate(job.smoke):
         more_cells, more_bytes = _check_size(job, index, budget, (cells, size_bytes), findings)
         cells, size_bytes = cells + more_cells, size_bytes + more_bytes
+        if smoke.grid != "box":
+            _check_first_window(job, index, solids, budget, findings)
         standing = _check_in_cells(job, index, solids, geometry_of, findings)
         check_mesh_grids(job, smoke, solids, geometry_of, findings)
         _check_air(job, smoke, index, standing, findings)
@@ -160,6 +162,25 @@ def _check_size(
             f"use {rounded_up(size):g} m or more",
         )
     return int(cells), size_bytes
+
+
+def _check_first_window(job: Job, index: int, solids: Solids, budget: MemoryBudget, findings: Findings) -> None:
+    """Note sources that lie so far apart that no window around them fits."""
+    smoke = job.smoke[index]
+    paths: list[KeyPath] = [("smoke", index, "source", number) for number in range(len(smoke.source))]
+    bounds = [solids[path].bounds for path in paths if path in solids]
+    if not bounds:
+        return
+    ends = np.clip([np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]], *smoke.limits(job.domain))
+    layers = np.ceil((ends[1] - ends[0]) / smoke.cell_size)
+    size_bytes = _bytes_of(layers, on_gpu=budget.on_gpu)
+    if size_bytes > budget.bytes:
+        findings.error(
+            ("smoke", index, "grid"),
+            f"{count(float(np.prod(layers)))} cells lie in one window around all sources, and need "
+            f"{gigabytes(size_bytes)}; {budget.owner} has {gigabytes(budget.bytes)}; give sources that are far apart a "
+            "smoke each, or use a larger cell_size",
+        )
 
 
 def _bytes_of(layers: NDArray[np.float64], *, on_gpu: bool) -> float:
