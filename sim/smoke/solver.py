@@ -99,7 +99,8 @@ class SmokeSolver:
         self._lift = parameters.lift_per_kelvin(gravity)
         self._domain, self._solids, self._outer = domain, solids, (forces or ForceField(())).on([(self.name,)])
         self._outside = OutsideAir(parameters.wind, self._outer)
-        self._frame_s, self._fitting = frame_s, Fitting(parameters, domain, frame_s)
+        stirred = parameters.turbulence.strength > 0.0 or self._outer.blows
+        self._frame_s, self._fitting = frame_s, Fitting(parameters, domain, frame_s, is_stirred=stirred)
         window = self._fitting.first(source.bounds(0.0, 0.0) for source in self.sources)
         self.grid = SmokeGrid.build(parameters, domain, solids, window)
         self.obstacles = Obstacles(self.grid, moving=moving)

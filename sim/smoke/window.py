@@ -1,10 +1,10 @@
 """The window: the part of a smoke's box that is computed, a box of cells around where there is something.
 
 A smoke whose grid follows is fitted at the start of frames. What has to be in the window is called *busy*: cells with
-smoke or heat, and air that moves against the wind; sources that emit; and where the air's own velocity takes all this
-within the frame. Around it lie `MARGIN` cells, and ends lie on blocks of `BLOCK` cells, counted from the lower corner
-of the smoke's box. Where the window ends, and the box does not, its sides are open to air as it is outside
-(`sim.smoke.sides`): at rest, or with the wind.
+smoke or heat, and air that moves against the wind, unless all air is stirred; sources that emit; and where the air's
+own velocity takes all this within the frame. Around it lie `MARGIN` cells, and ends lie on blocks of `BLOCK` cells,
+counted from the lower corner of the smoke's box. Where the window ends, and the box does not, its sides are open to air
+as it is outside (`sim.smoke.sides`): at rest, or with the wind.
 
 The window is left as it is while the next frame fits and it is not much too large; a new one is fitted to some frames
 ahead, so that a front that moves does not ask for one in each.
@@ -54,8 +54,14 @@ class Fitting:
         follows: whether the grid is a window at all; without, it is the whole box for ever.
     """
 
-    def __init__(self, parameters: SmokeParameters, domain: DomainParameters, frame_s: float) -> None:
-        """Take a smoke, which may have the domain for its box, and the length of a frame [s]."""
+    def __init__(
+        self, parameters: SmokeParameters, domain: DomainParameters, frame_s: float, *, is_stirred: bool
+    ) -> None:
+        """Take a smoke, which may have the domain for its box, and the length of a frame [s].
+
+        Where gusts or winds stir all air, its motion alone does not count: fresh air would be busy at once.
+        """
+        self._counts_motion = not is_stirred
         self.follows = parameters.grid != "box"
         self._parameters, self._frame_s = parameters, frame_s
         self._corner = np.asarray(parameters.min or domain.min)
@@ -93,8 +99,9 @@ class Fitting:
     def _busy(self, air: Air, window: Window, outside: Vector3, frames: float, rows: Rows) -> Ends | None:
         """Where what is in a window will be busy in so many frames."""
         wind, step = ti.math.vec3(outside), self._frame_s / self._parameters.cell_size
-        fastest = _find_motion(air, wind, rows)[0]
-        least = max(LEAST_MOTION * fastest, CREEP / step)
+        least = np.inf
+        if self._counts_motion:
+            least = max(LEAST_MOTION * _find_motion(air, wind, rows)[0], CREEP / step)
         ends = np.zeros((2, 3))
         for axis in range(3):
             down, up = _find_ends(axis, air, wind, least, frames * step, rows)

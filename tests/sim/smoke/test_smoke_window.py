@@ -121,6 +121,22 @@ def test_a_window_gets_small_again():
     assert max(cells) > 3 * cells[-1]
 
 
+@pytest.mark.parametrize("stirs", ["gusts", "force"])
+def test_what_stirs_all_air_alike_does_not_make_a_window_grow(stirs):
+    """After the source has ended nothing but eddies moves: they are in all cells, fresh ones too."""
+    cold = {**PUFF, "temperature": 293.0, "end_s": 0.1}
+    smoke = {"name": "puff", "cell_size": CELL, "grid": "open", "source": [cold], "open_faces": SIDES}
+    if stirs == "gusts":
+        scene = {"smoke": [{**smoke, "turbulence": {"strength": 0.4, "size": 0.3}}]}
+    else:
+        eddies = {"type": "turbulence", "speed": 0.5, "size": 1.0}
+        scene = {"smoke": [smoke], "force": [eddies, {**GUSTY, "velocity": (0.3, 0.0, 0.0), "gusts": 0.9}]}
+    world = build_world(SceneParameters.model_validate({**scene, "domain": LONG}), frames_per_second=FPS)
+    for _ in range(24):
+        world.advance_frame()
+    assert np.prod(world.solvers["puff"].grid.cells) < 40_000
+
+
 def test_fresh_air_moves_with_the_wind():
     """Which nothing disturbs, wherever the window is."""
     idle = {**PUFF, "temperature": 293.0, "fluctuation": 0.0}
