@@ -95,8 +95,11 @@ def size_of_solid(_job: Job, body: RigidBodyParameters) -> float:
 
 
 def expected_cells(smoke: SmokeParameters, domain: DomainParameters) -> float:
-    """About how many cells of a smoke are computed at a time: of a window nobody knows before."""
-    return prod(smoke.cell_counts(domain)) * (1.0 if smoke.grid == "box" else WINDOW_SHARE)
+    """About how many cells of a smoke are computed at a time.
+
+    Of a window nobody knows before; an open grid is taken to have as many as its box.
+    """
+    return prod(smoke.cell_counts(domain)) * (WINDOW_SHARE if smoke.grid == "window" else 1.0)
 
 
 def size_of_liquid(job: Job, fluid: FluidParameters) -> float:
