@@ -102,6 +102,18 @@ class SceneParameters(Parameters):
         return self
 
     @model_validator(mode="after")
+    def _has_whole_boxes_beside_others(self) -> Self:
+        other = "fluid" if self.fluid else "cloth" if self.cloth else None
+        for number, smoke in enumerate(self.smoke):
+            if smoke.grid != "box" and other is not None:
+                raise KeyRefusedError(
+                    ("smoke", number, "grid"),
+                    f'"{smoke.grid}" is of a smoke in a job with {other}, which needs all cells of its box; '
+                    'use "box", or remove one of both',
+                )
+        return self
+
+    @model_validator(mode="after")
     def _has_one_air(self) -> Self:
         if self.smoke and (conflict := conflict_in_one_air(self.cloth)):
             raise KeyRefusedError(*conflict)

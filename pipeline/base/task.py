@@ -95,6 +95,7 @@ class FailureKind(StrEnum):
     DISK_FULL = "disk full"
     CANCELLED = "cancelled"
     DIVERGED = "diverged"
+    OUTGROWN = "outgrew memory"
 
 
 @dataclass(frozen=True, slots=True)

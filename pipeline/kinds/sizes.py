@@ -15,11 +15,15 @@ from pipeline.kinds.elements import sheet_of
 from pipeline.model.boxes import Box
 from pipeline.model.job import Job
 from sim.cloth.parameters import ClothParameters
+from sim.core.domain import DomainParameters
 from sim.core.parameters import Vector3
 from sim.fluid.parameters import FluidParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.parameters import AnimationShape, BoxShape, FileShape, Placement, Shape
 from sim.smoke.parameters import SmokeParameters
+
+WINDOW_SHARE = 0.2
+"""Of the cells of a smoke's box that a window is taken to have, on average over a film: a guess."""
 
 
 class Measures(NamedTuple):
@@ -88,6 +92,14 @@ def box_of(placement: Placement) -> Box:
 def size_of_solid(_job: Job, body: RigidBodyParameters) -> float:
     """Edge of the cube of a body's volume [m]. Raises as `measures_of`."""
     return float(measures_of(body).volume ** (1.0 / 3.0))
+
+
+def expected_cells(smoke: SmokeParameters, domain: DomainParameters) -> float:
+    """About how many cells of a smoke are computed at a time.
+
+    Of a window nobody knows before; an open grid is taken to have as many as its box.
+    """
+    return prod(smoke.cell_counts(domain)) * (WINDOW_SHARE if smoke.grid == "window" else 1.0)
 
 
 def size_of_liquid(job: Job, fluid: FluidParameters) -> float:

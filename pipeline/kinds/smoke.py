@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import prod
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Codec, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
-from pipeline.kinds.sizes import size_of_smoke
+from pipeline.kinds.sizes import expected_cells, size_of_smoke
 from pipeline.kinds.work import smoke_work
 from pipeline.model.boxes import smoke_box
 from pipeline.model.job import Job
@@ -74,12 +74,14 @@ def _coarser(job: Job, factor: float, solids: SolidBuilder | None) -> list[Chang
 
 def _objects(job: Job, _layout: JobLayout, smoke: SmokeParameters, material_of: Materials) -> Iterator[SceneObject]:
     box_min, box_max = smoke.corners(job.domain)
+    # Where the box has no end nothing is cut off, and nothing fades.
+    ends = () if smoke.grid == "open" else smoke.open_faces
     yield VolumeSequenceObject(
         name=smoke.name,
         file=VOLUME.file_of(smoke.name),
         box_min=box_min,
         box_max=box_max,
-        open_faces=smoke.open_faces,
+        open_faces=ends,
         ambient_temperature=smoke.ambient_temperature,
         material=material_of(BODY),
     )
@@ -124,7 +126,7 @@ VOLUME = Product(
     suffix=".vdb",
     tools=_openvdb,
     parameters=lambda job: {"volume": job.volume, "fps": job.fps, "shutter": job.render.shutter},
-    memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * prod(smoke.cell_counts(job.domain)),
+    memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * ceil(expected_cells(smoke, job.domain)),
     write=_write_volume,
     validate=validate_volume,
     file_bytes=lambda cells: 20_000 + 3.0 * cells,
@@ -137,7 +139,7 @@ SMOKE = Kind(
     parameters=SmokeParameters,
     about="Smoke.",
     size="{:,} smoke cells",
-    elements=lambda job, smoke: prod(smoke.cell_counts(job.domain)),
+    elements=lambda job, smoke: expected_cells(smoke, job.domain),
     snapshot_bytes=(26.5, 2.0, 26.0),
     work=smoke_work,
     solver_bytes=230.0,

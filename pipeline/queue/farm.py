@@ -250,6 +250,8 @@ class FarmRunner:
                 self._settle(job, Desired.PAUSE, f"the disk is full{place}")
             case JobOutcome.NO_GPU:
                 self._settle(job, Desired.PAUSE, "every GPU has failed")
+            case JobOutcome.OUTGROWN:
+                self._settle(job, Desired.PAUSE, next(failed.message for failed in outcome.failures))
             case _ if control.signals and job.submission == self.submission:
                 self._settle(job, Desired.PAUSE, "stopped by hand")
             case _:  # its entry says what is wanted: it pauses, or waits for its next turn

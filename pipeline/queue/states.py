@@ -63,7 +63,7 @@ def state_after(outcome: str | None) -> JobState:
 def ending_of(outcome: str | None) -> str:
     """How a run ended: the state after it, and the particular reason where there is one."""
     state = state_after(outcome)
-    reasons = (JobOutcome.TOO_MANY_FAILURES, JobOutcome.DISK_FULL, JobOutcome.NO_GPU)
+    reasons = (JobOutcome.TOO_MANY_FAILURES, JobOutcome.DISK_FULL, JobOutcome.NO_GPU, JobOutcome.OUTGROWN)
     return f"{state} ({outcome})" if outcome in reasons else state
 
 

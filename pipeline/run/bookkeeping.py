@@ -15,8 +15,10 @@ from pipeline.run.plan import input_hashes
 from pipeline.run.scheduler import OWN_FAILURES
 from pipeline.store.receipts import committed_receipt
 
-_FORCED_ENDS = frozenset(FailureKind) - OWN_FAILURES - {FailureKind.DISK_FULL}
+_FORCED_ENDS = frozenset(FailureKind) - OWN_FAILURES - {FailureKind.DISK_FULL, FailureKind.OUTGROWN}
 """Ends that may come from outside, at any moment: between a commit and the word of it, too."""
+
+_MEMORY = {FailureKind.OUT_OF_MEMORY, FailureKind.OUTGROWN}
 
 Settled = Committed | Finished | Failed
 """What becomes of a task, as the scheduler takes it."""
@@ -107,7 +109,7 @@ class RunRecord:
         return [*adopted, end]
 
     def _take_failure(self, failed: Failed, untold: Sequence[ArtifactPath]) -> list[Settled]:
-        if failed.kind is FailureKind.OUT_OF_MEMORY and (lighter := self._lighter(failed.task_id)):
+        if failed.kind in _MEMORY and (lighter := self._lighter(failed.task_id)):
             failed = replace(failed, message=f"{failed.message}; less is needed with {lighter}")
         # A process that was killed could not remove what it was writing, nor tell of its last commit.
         self.parts_left = True
@@ -129,6 +131,8 @@ class RunRecord:
             place = failed.full_place or self.layout.root
             sentence = f"the disk is full ({place}): the job pauses; free some space and submit it again"
             self.notify(Notice(sentence))
+        if failed.kind is FailureKind.OUTGROWN:
+            self.notify(Notice(f"{failed.message}: the job pauses"))
         return [*adopted, failed]
 
     def _lighter(self, task_id: TaskId) -> str:

@@ -147,6 +147,7 @@ class JobOutcome(StrEnum):
     TOO_MANY_FAILURES = "too many failures"
     DISK_FULL = "disk full"
     NO_GPU = "no GPU left"
+    OUTGROWN = "outgrew memory"
     DRAINED = "drained"
     CANCELLED = "cancelled"
 
@@ -232,6 +233,7 @@ _EXIT_CODES = {
     JobOutcome.TOO_MANY_FAILURES: 6,
     JobOutcome.DISK_FULL: 7,
     JobOutcome.NO_GPU: 9,
+    JobOutcome.OUTGROWN: 10,
     JobOutcome.DRAINED: 130,  # as shells report a program that Ctrl-C ended
     JobOutcome.CANCELLED: 130,
 }

@@ -36,6 +36,11 @@ class InvalidTransitionError(PipelineError):
 
 OWN_FAILURES = frozenset({FailureKind.FAILED, FailureKind.DIVERGED})
 """The task's own: it would fail the same way again."""
+_PAUSES = {
+    FailureKind.DISK_FULL: events.JobOutcome.DISK_FULL,
+    FailureKind.OUTGROWN: events.JobOutcome.OUTGROWN,
+}
+"""Nothing is wrong with the task, and it goes on from where it is once there is room."""
 
 
 @dataclass(slots=True)
@@ -266,9 +271,9 @@ class Scheduler:
     def _fail(self, entry: _Entry, kind: FailureKind) -> list[events.Instruction]:
         if kind in OWN_FAILURES:
             return self._fail_for_good(entry)
-        if kind is FailureKind.DISK_FULL:
+        if kind in _PAUSES:
             self._end(entry, TaskState.CANCELLED)
-            return self._drain(events.JobOutcome.DISK_FULL)
+            return self._drain(_PAUSES[kind])
         if kind is FailureKind.CANCELLED and self._ending is not None:
             self._end(entry, TaskState.CANCELLED)
             return []

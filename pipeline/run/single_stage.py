@@ -24,7 +24,7 @@ from pipeline.run.executors.base import Assignment
 from pipeline.run.plan import plan_job
 from pipeline.store.receipts import Receipt, is_committed, read_receipt, verify_artifact
 
-_STOPS = frozenset({FailureKind.DISK_FULL, FailureKind.CANCELLED})
+_STOPS = frozenset({FailureKind.DISK_FULL, FailureKind.OUTGROWN, FailureKind.CANCELLED})
 """Failures after which no further task is tried."""
 
 

@@ -70,6 +70,7 @@ class BoundsStage(Stage):
             for frame in range(job.frame_count)
         ]
         static = [body for body in job.rigid if body.kind == "static"]
+        endless = [smoke.name for smoke in job.smoke if smoke.grid == "open"]
         film = Task(
             id=FILM,
             stage=self.name,
@@ -84,6 +85,11 @@ class BoundsStage(Stage):
                 tools=tools,
                 domain=job.domain,
                 smoke={smoke.name: smoke.corners(job.domain) for smoke in job.smoke},
+                **(
+                    {"endless": endless}
+                    if (endless := [smoke.name for smoke in job.smoke if smoke.grid == "open"])
+                    else {}
+                ),
                 static={body.name: {"position": body.position, "rotation_deg": body.rotation_deg} for body in static},
                 tank=job.has_panes,
                 **({"beside": beside} if (beside := _beside(job)) else {}),
@@ -128,7 +134,7 @@ def _of_film(context: TaskContext) -> Reach:
     """How far all frames and the bodies that stand still reach, as far as they are in the world."""
     job, layout = context.job, context.layout
     domain = np.array([job.domain.min, job.domain.max])
-    smokes = [smoke.corners(job.domain) for smoke in job.smoke]
+    smokes = [smoke.limits(job.domain) for smoke in job.smoke]
     boxes = np.concatenate([[domain, *smokes], scene_boxes(job)])
     world = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
     reaches = [

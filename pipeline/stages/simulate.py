@@ -37,6 +37,7 @@ from pipeline.store.provenance import read_text
 from pipeline.store.receipts import read_receipt
 from sim.core.runtime import DeviceUnavailableError, initialize, resolve_device
 from sim.core.snapshots import Snapshot
+from sim.core.solver import Grows, OutgrownError
 from sim.core.world import FrameReport
 from sim.scene import SceneParameters
 
@@ -122,6 +123,7 @@ class SimulateStage(Stage):
 
         Raises:
             SimulationDivergedError: the state became unphysical; the last good checkpoint is kept.
+            OutgrownError: a body grows beyond memory; a checkpoint of the last frame is kept.
             StageUnavailableError: the frames so far come from another kind of device, or from a recording.
         """
         missing = [k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)]
@@ -157,6 +159,7 @@ class _Simulation:
     """One attempt at the simulation of a job."""
 
     def __init__(self, context: TaskContext) -> None:
+        from pipeline.kinds.checks.smoke import growth_refusal
         from sim.core.launch import on_compiled  # it loads Taichi, which plans need not
 
         self._context = context
@@ -165,6 +168,9 @@ class _Simulation:
         make_folder(self._folder, within=context.layout.root)
         self._device = initialize(context.job.chosen_device, threads=context.threads, gpu=context.gpu)
         self._world = world_of(context.job)
+        for solver in self._world.solvers.values():
+            if isinstance(solver, Grows):
+                solver.refusal = growth_refusal(context.job)
         self._checkpointed_at = time.monotonic()
         self._last_checkpoint = -1
 
@@ -183,7 +189,11 @@ class _Simulation:
             while self._world.frame < last:
                 if self._context.stop_requested():
                     break
-                report = self._world.advance_frame()
+                try:
+                    report = self._world.advance_frame()
+                except OutgrownError:  # the world is as it was, and goes on from here where there is more memory
+                    self._hand_in_checkpoint(writer)
+                    raise
                 if report.frame in wanted:
                     writer.submit(partial(self._commit, report, self._world.snapshots()))
                 self._context.progress(report.frame + 1, last + 1, _describe(report))

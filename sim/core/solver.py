@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -42,6 +42,10 @@ class SimulationDivergedError(RuntimeError):
 
     def __str__(self) -> str:
         return f"{self.finding}; {self.hint}" if self.hint else self.finding
+
+
+class OutgrownError(RuntimeError):
+    """There is no memory for what a body grows to; its state is still that of the last frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +103,18 @@ class TakesPushes(HasViews, Protocol):
 
     def push(self, body: str, change: NDArray[np.floating]) -> None:
         """Change the velocity of what is free to move, in the order of `view`, by (n, 3) or (3,) [m/s]."""
+
+
+@runtime_checkable
+class Grows(Protocol):
+    """A solver that takes more memory as its bodies grow.
+
+    Attributes:
+        refusal: why there is no memory for so many more elements, in words, or None; asked before there are more, and
+            where it refuses `OutgrownError` is raised. None: nobody is asked.
+    """
+
+    refusal: Callable[[float], str | None] | None
 
 
 class Coupling(Protocol):

@@ -39,8 +39,8 @@ def too_thin_bodies(
 def can_come(
     body: RigidBodyParameters, geometry: BodyGeometry, smoke: SmokeParameters, domain: DomainParameters
 ) -> bool:
-    """Whether a body may come into a smoke's box: on its path, or anywhere in the domain and out of its open faces."""
-    box = smoke.corners(domain)
+    """Whether a body may come to where a smoke can be: by its path, or if it may leave the domain."""
+    box = smoke.limits(domain)
     reach = float(np.linalg.norm(geometry.centre_of_mass)) + geometry.radius
     if body.kind == "kinematic":
         low, high = path_of(body).hull()

@@ -1,7 +1,7 @@
 """All forces of a job as kernels see them: accelerations, drag and moving air, at a place and a moment."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +60,7 @@ class ForceField:
 
     Attributes:
         parameters: the forces.
-        gravity: of the job [m/s²].
+        strengths: of them at the moment [-].
     """
 
     def __init__(self, parameters: Sequence[BaseForce]) -> None:
@@ -75,16 +75,16 @@ class ForceField:
         self._numbers, self._modes = on_device(numbers.ravel()), on_device(modes.ravel())
         self._salts = on_device(np.array(salts, dtype=np.uint32).view(np.int32))
         self._strengths, self._time_s = on_device(np.zeros(len(self.parameters))), 0.0
-        self._strengths_now: tuple[float, ...] = ()
+        self.strengths: tuple[float, ...] = ()
         self.at(0.0)
 
     def at(self, time_s: float) -> None:
         """Take all forces to a simulated time [s]."""
         self._time_s = time_s
         strengths = tuple(force.strength(time_s) for force in self.parameters)
-        if strengths and strengths != self._strengths_now:
+        if strengths and strengths != self.strengths:
             self._strengths.from_numpy(np.array(strengths, dtype=np.float32))
-        self._strengths_now = strengths
+        self.strengths = strengths
 
     def on(self, names: Sequence[tuple[str, ...]]) -> "ForcesOn":
         """The forces on the bodies of a solver, each of which has one or more names: its own, and its group's."""
@@ -111,7 +111,8 @@ class ForcesOn:
         meets = [[not force.only or bool(set(force.only) & set(own)) for force in field.parameters] for own in names]
         acts = np.array(meets, dtype=np.int32).reshape(len(names), len(field.parameters))
         self._acts = on_device(acts.ravel())
-        own = [force for force, meant in zip(field.parameters, acts.any(axis=0), strict=True) if meant]
+        self._acts_on_any = acts.any(axis=0)
+        own = [force for force, meant in zip(field.parameters, self._acts_on_any, strict=True) if meant]
         winds = [force for force in own if isinstance(force, AirForce)]
         self.accelerates, self.blows = len(winds) < len(own), bool(winds)
         self.largest_acceleration = sum(map(_largest_acceleration, own))
@@ -122,6 +123,25 @@ class ForcesOn:
     def now(self) -> ForceTable:
         """The bundle for kernels, at the present moment."""
         return self._field.now(self._acts)
+
+    def even_wind(self) -> tuple[Float64Array, float]:
+        """Mean velocity of the winds that blow everywhere, (3,) [m/s], and the rate at which smoke's air takes it on.
+
+        At the present moment; gusts and what is limited to a shape are left out.
+        """
+        velocity, response = np.zeros(3), 0.0
+        for wind, strength in self._even_winds():
+            velocity += strength * np.asarray(wind.velocity)
+            response = max(response, strength / wind.response_s)
+        return velocity, response
+
+    def _even_winds(self) -> Iterator[tuple[WindForce, float]]:
+        own = zip(self._field.parameters, self._field.strengths, self._acts_on_any, strict=True)
+        return (
+            (force, strength)
+            for force, strength, acts in own
+            if acts and isinstance(force, WindForce) and force.within is None
+        )
 
 
 @func

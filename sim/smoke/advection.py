@@ -44,20 +44,19 @@ class Advection:
         work: tuple[ti.Ndarray, ...],
         *,
         maccormack: bool,
-        wind: Vector3 = (0.0, 0.0, 0.0),
     ) -> None:
-        """Take the air of a grid, six arrays to work in, and the velocity of the air outside [m/s]."""
+        """Take the air of a grid, and six arrays to work in."""
         self._air, self._cells_per_metre = air, 1.0 / grid.cell_size
         self._predicted, self._corrected = Faces(*work[:3]), Faces(*work[3:])
         self._maccormack = maccormack
         low = (1.0 if grid.lets_in(axis, 0) else -FAR for axis in range(3))
         high = (float(n) if grid.lets_in(axis, 1) else FAR for axis, n in enumerate(grid.cells))
-        self._outside = Outside(ti.math.vec3(*low), ti.math.vec3(*high), ti.math.vec3(wind))
+        self._low, self._high = ti.math.vec3(*low), ti.math.vec3(*high)
 
-    def advance(self, dt: float) -> None:
-        """Advect by dt [s] with the present velocity."""
-        step = dt * self._cells_per_metre
-        box, outside, state = self._air.box, self._outside, self._air.state
+    def advance(self, dt: float, wind: Vector3 = (0.0, 0.0, 0.0)) -> None:
+        """Advect by dt [s] with the present velocity; the air outside has that of a wind [m/s]."""
+        step, outside = dt * self._cells_per_metre, Outside(self._low, self._high, ti.math.vec3(wind))
+        box, state = self._air.box, self._air.state
         predicted, corrected = self._predicted, self._corrected
         for axis in range(3):
             _predict_faces(axis, box, outside, state.velocity, predicted[axis], step)

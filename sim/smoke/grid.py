@@ -30,6 +30,36 @@ LOWEST, CENTRE = (0.0, 0.0, 0.0), (0.5, 0.5, 0.5)  # corner and centre of a cell
 
 
 @dataclass(frozen=True)
+class Window:
+    """A part of a smoke's box that is computed, whole cells of it."""
+
+    first: Index3  # its lowest cell, counted from that of the box; negative where the box has no end
+    cells: Index3  # how many along x, y, z
+
+    @classmethod
+    def around(cls, box: NDArray[np.float64], parameters: SmokeParameters, domain: DomainParameters) -> Window:
+        """The cells around a box between two corners [m], (2, 3), as far as the smoke can be there."""
+        corner, counts = np.asarray(parameters.min or domain.min), parameters.cell_counts(domain)
+        limits = np.array(parameters.limits(domain))
+        first, last = np.where(np.isinf(limits), limits, [(0, 0, 0), np.subtract(counts, 1)])
+        low = np.clip(np.floor((box[0] - corner) / parameters.cell_size) - 1, first, last)
+        high = np.clip(np.ceil((box[1] - corner) / parameters.cell_size), low, last)
+        a, b, c = (int(n) for n in low)
+        x, y, z = (int(n) for n in high - low + 1)
+        return cls((a, b, c), (x, y, z))
+
+    def inner_faces(self, box: Index3) -> frozenset[Face]:
+        """Its sides that are not sides of a box of so many cells."""
+        faces: tuple[tuple[Face, Face], ...] = (("x-", "x+"), ("y-", "y+"), ("z-", "z+"))
+        return frozenset(
+            face
+            for pair, first, n, end in zip(faces, self.first, self.cells, box, strict=True)
+            for face, is_inner in zip(pair, (first != 0, first + n != end), strict=True)
+            if is_inner
+        )
+
+
+@dataclass(frozen=True)
 class SmokeGrid:
     """A box of cubic cells, its open sides and the solids in it that stand still.
 
@@ -42,12 +72,17 @@ class SmokeGrid:
     open_faces: frozenset[Face]  # sides of the box that air passes freely; the others are walls
     distance: NDArray[np.float32]  # of corners from these solids, (nx + 1, ny + 1, nz + 1), not beyond `FAR` [cells]
     inflow_faces: frozenset[Face] = frozenset()  # where wind comes in at a given speed; walls to the pressure
+    first: Index3 = (0, 0, 0)  # its lowest cell, counted from that of the smoke's box (`Window`)
 
     @classmethod
     def build(
-        cls, parameters: SmokeParameters, domain: DomainParameters, solids: Sequence[HasSignedDistance] = ()
+        cls,
+        parameters: SmokeParameters,
+        domain: DomainParameters,
+        solids: Sequence[HasSignedDistance] = (),
+        window: Window | None = None,
     ) -> SmokeGrid:
-        """The grid of a smoke: its own box, or the domain's where it names none.
+        """The grid of a smoke: its own box, or the domain's where it names none, or a window of that.
 
         A box that is no whole number of cells long is rounded up, keeping its lower corner.
 
@@ -62,7 +97,7 @@ class SmokeGrid:
                 )
         if problem := parameters.wind_problem():
             raise ValueError(f'smoke "{parameters.name}": wind {problem}')
-        empty = cls.of_box(parameters, domain)
+        empty = cls.of_box(parameters, domain, window)
         if not solids:
             return empty
         for region in solids:
@@ -78,11 +113,19 @@ class SmokeGrid:
         return grid
 
     @classmethod
-    def of_box(cls, parameters: SmokeParameters, domain: DomainParameters) -> SmokeGrid:
-        """The cells of a smoke's box, of which none is solid; the box must not be empty."""
+    def of_box(cls, parameters: SmokeParameters, domain: DomainParameters, window: Window | None = None) -> SmokeGrid:
+        """The cells of a smoke's box, or of a window, of which none is solid; the box must not be empty.
+
+        Where a window ends, and the box does not, air passes.
+        """
         cells, inflow = parameters.cell_counts(domain), frozenset(parameters.windward_faces)
-        is_open, lower = frozenset(parameters.open_faces) - inflow, parameters.min or domain.min
-        return cls.of_cells(lower, parameters.cell_size, cells, is_open, inflow)
+        is_open, lower = frozenset(parameters.open_faces), parameters.min or domain.min
+        if window is not None:
+            is_open |= window.inner_faces(cells)
+            x, y, z = (low + n * parameters.cell_size for low, n in zip(lower, window.first, strict=True))
+            lower, cells = (x, y, z), window.cells
+        grid = cls.of_cells(lower, parameters.cell_size, cells, is_open - inflow, inflow)
+        return grid if window is None else replace(grid, first=window.first)
 
     @classmethod
     def of_cells(
@@ -95,7 +138,8 @@ class SmokeGrid:
     ) -> SmokeGrid:
         """A box of so many cells, without solids."""
         corners = tuple(n + 1 for n in cells)
-        return cls(origin, cell_size, cells, open_faces, np.full(corners, FAR, np.float32), inflow_faces)
+        far = np.broadcast_to(np.float32(FAR), corners)  # which takes no memory
+        return cls(origin, cell_size, cells, open_faces, far, inflow_faces)
 
     def with_solids(self, solids: Sequence[HasSignedDistance]) -> SmokeGrid:
         """The same box with these solids in it as well."""
@@ -106,6 +150,18 @@ class SmokeGrid:
             scaled = near / self.cell_size
             scaled[np.abs(scaled) < ROUNDING] = 0.0
             distance[spans] = np.minimum(distance[spans], scaled.astype(np.float32))
+        return replace(self, distance=distance)
+
+    def with_solids_of(self, others: Sequence[SmokeGrid]) -> SmokeGrid:
+        """The same cells with the solids of other windows of the box in them as well."""
+        distance = self.distance
+        for other in others:
+            shift = np.subtract(other.first, self.first)
+            low, high = np.maximum(0, shift), np.minimum(distance.shape, shift + other.distance.shape)
+            if np.all(low < high):
+                distance = distance.copy() if distance is self.distance else distance
+                own, theirs = tuple(map(slice, low, high)), tuple(map(slice, low - shift, high - shift))
+                distance[own] = np.minimum(distance[own], other.distance[theirs])
         return replace(self, distance=distance)
 
     def misses(self, region: HasSignedDistance) -> bool:
@@ -129,6 +185,11 @@ class SmokeGrid:
             outside |= (cell_corners(self.distance, corner) > 0.0).astype(np.int32) << corner
         solid: NDArray[np.bool_] = (outside == 0) | is_split(outside)
         return solid
+
+    @property
+    def window(self) -> Window:
+        """Which cells of the smoke's box it has."""
+        return Window(self.first, self.cells)
 
     @property
     def padded(self) -> Index3:

@@ -2,9 +2,11 @@
 
 import math
 
+import numpy as np
 import taichi as ti
 
 from sim.core.launch import kernel
+from sim.core.parameters import Vector3
 from sim.forces.field import ForcesOn, ForceTable, acceleration_at, air_at, drag_at, kept_off
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import lane_items, lane_place, row_start, steps
@@ -12,6 +14,26 @@ from sim.smoke.obstacles import Air
 from sim.smoke.parameters import SmokeParameters
 
 STANDARD_GRAVITY = 9.81  # at which smoke has the weight alpha of the parameters [m/s²]
+
+
+class OutsideAir:
+    """The air around a smoke's grid: it takes on the winds that blow everywhere, as that within does.
+
+    Attributes:
+        velocity: of it now [m/s].
+    """
+
+    def __init__(self, wind: Vector3, forces: ForcesOn) -> None:
+        """It moves with a wind [m/s] at the start."""
+        self.velocity, self._forces = wind, forces
+
+    def advance(self, dt: float) -> None:
+        """Take on the winds of the moment for dt [s]."""
+        wind, rate = self._forces.even_wind()
+        if rate > 0.0:
+            now = np.asarray(self.velocity)
+            x, y, z = (now - math.expm1(-rate * dt) * (wind - now)).tolist()
+            self.velocity = x, y, z
 
 
 class OuterForces:

@@ -17,7 +17,8 @@ q = p dt / h, half a cell from the side, u' = u - 2 (q - q_side) and q_side = -v
     u' = (u - 2 q) / (1 + v dt / h),
 
 a smaller conductance of the face and a smaller velocity before the projection: symmetric, positive, stable whatever dt,
-and in a steady flow exactly Bernoulli's pressure.
+and in a steady flow exactly Bernoulli's pressure. Where the air outside moves inwards itself, as forces of wind make
+it, v is what comes on top of that.
 """
 
 from collections.abc import Sequence
@@ -35,9 +36,16 @@ from sim.smoke.obstacles import Air, flux_part, is_solid
 
 
 def brake_inflow(
-    air: Air, operator: Operator, open_sides: tuple[tuple[int, int], ...], cells: tuple[int, int, int], step: float
+    air: Air,
+    operator: Operator,
+    open_sides: tuple[tuple[int, int], ...],
+    cells: tuple[int, int, int],
+    wind: Vector3,
+    step: float,
 ) -> None:
     """Prepare the projection for air that comes in through open sides, each an axis and a side of it, 0 or 1.
+
+    Outside it has the velocity of a wind [m/s].
 
     Velocities and conductances of inflow become smaller; of the latter those of the finest level, at the faces of the
     sides and the cells behind them. The coarser ones only precondition, and stay those of p = 0. What obstacles cover
@@ -45,7 +53,7 @@ def brake_inflow(
     """
     if open_sides:
         nx, ny, nz = cells
-        _brake(open_sides, max(ny * nz, nx * nz, nx * ny), air, operator, step)
+        _brake(open_sides, max(ny * nz, nx * nz, nx * ny), air, operator, ti.math.vec3(wind), step)
 
 
 def start_wind(air: Air, wind: Vector3, windward: Sequence[Face]) -> None:
@@ -65,7 +73,7 @@ def blow_in(air: Air, wind: Vector3, windward: Sequence[Face]) -> None:
 
 
 @kernel
-def _brake(sides: ti.template(), places: ti.i32, air: Air, operator: Operator, step: ti.f32):
+def _brake(sides: ti.template(), places: ti.i32, air: Air, operator: Operator, wind: ti.math.vec3, step: ti.f32):
     box, solids, velocity = ti.static((air.box, air.solids, air.state.velocity))
     # All sides in one loop, a place of each a turn: starting a loop takes longer than running it.
     for n in range(places):
@@ -75,9 +83,10 @@ def _brake(sides: ti.template(), places: ti.i32, air: Air, operator: Operator, s
                 normal = ti.static((velocity.x, velocity.y, velocity.z)[axis])
                 conductance = ti.static((operator.faces.x, operator.faces.y, operator.faces.z)[axis])
                 face = cell + side * steps(box)[axis]
-                inward = normal[face] if ti.static(side == 0) else -normal[face]
-                drag = 1.0 + step * ti.max(inward, 0.0)
-                normal[face] /= drag
+                sign = ti.static(1.0 - 2.0 * side)
+                outside, inward = ti.max(sign * wind[axis], 0.0), sign * normal[face]
+                drag = 1.0 + step * ti.max(inward - outside, 0.0)
+                normal[face] = sign * (outside + (inward - outside) / drag)
                 conductance[face] = 2.0 * flux_part(solids, axis, face) / drag
     # Cells behind two sides are found twice, with the same result.
     for n in range(places):

@@ -147,28 +147,32 @@ class SweptShape:
         reach: largest distance of its points from its origin [m].
     """
 
-    def __init__(self, placement: Placement, grid: SmokeGrid) -> None:
-        """Build the shape; where it stands does not matter.
+    def __init__(self, placement: Placement, cell_size: float) -> None:
+        """Build the shape for grids of this cell size [m]; where it stands does not matter.
 
         Raises:
             ShapeError: it cannot be built.
         """
         placed = build_solid(placement)
-        self._grid = grid
+        self._cell_size = cell_size
         self._solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
         self.reach = float(np.linalg.norm(np.abs(self._solid.bounds).max(axis=0)))
         self._distance = self._solid.signed_distance
         self._is_exact = not isinstance(placement.shape, COSTLY_SHAPES)
         if not self._is_exact:
-            spacing = grid.cell_size / LOOKUPS_PER_CELL
+            spacing = cell_size / LOOKUPS_PER_CELL
             self._distance = LevelSet.sample(self._solid, spacing, exact_within=2.0 * spacing).signed_distance
 
-    def covered(self, poses: Sequence[Motion], axis: int) -> Swept:
-        """The faces across an axis, or the `CELLS`, that it covers in one of the poses at least."""
-        grid = self._grid
+    def bounds(self, pose: Motion) -> Array:
+        """Corners of the box around the shape in a pose [m], (2, 3)."""
+        turned = rotation.matrices(pose.orientation)
+        return PlacedSolid(self._solid.shape, self._solid.scale, turned, pose.position).bounds
+
+    def covered(self, grid: SmokeGrid, poses: Sequence[Motion], axis: int) -> Swept:
+        """The faces of a grid across an axis, or the `CELLS`, that it covers in one of the poses at least."""
         shape: Index3 = grid.cells if axis == CELLS else grid.face_shape(axis)
         offset = np.array([0.0 if a == axis else 0.5 for a in range(3)])
-        windows = [self._window(pose, shape, offset) for pose in poses]
+        windows = [self._window(grid, pose, shape, offset) for pose in poses]
         first = np.min([low for low, _ in windows], axis=0)
         size = np.maximum(np.max([high for _, high in windows], axis=0) - first, 0)
         last = np.full(size, -1, np.int64)
@@ -182,7 +186,7 @@ class SweptShape:
             asked = np.nonzero((last[window] < 0) & (free_until[window] <= ways[number]))
             if len(asked[0]) == 0:
                 continue
-            places = self._positions(np.stack(asked, axis=-1) + low, offset)
+            places = _positions(grid, np.stack(asked, axis=-1) + low, offset)
             own = rotation.rotated(rotation.conjugate(pose.orientation), places - pose.position)
             distance = self._distance(own)
             last[window][asked] = np.where(distance < 0.0, number, -1)
@@ -191,7 +195,7 @@ class SweptShape:
         found = np.argwhere(last >= 0) + first
         padded = grid.padded
         indices = ((found[:, 0] + 1) * padded[1] + found[:, 1] + 1) * padded[2] + found[:, 2] + 1
-        return Swept(indices.astype(np.int32), self._positions(found, offset), last[last >= 0])
+        return Swept(indices.astype(np.int32), _positions(grid, found, offset), last[last >= 0])
 
     def _ways_to_the_last(self, poses: Sequence[Motion]) -> NDArray[np.float64]:
         """Bound of how far points of the shape go from each pose to the last one [m], (n,)."""
@@ -199,18 +203,18 @@ class SweptShape:
         turned = np.stack([rotation.matrices(pose.orientation) for pose in poses])
         steps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
         turns = np.linalg.norm(np.diff(turned, axis=0), axis=(1, 2))
-        ways = (1.0 + ROUND_OFF) * (steps + self.reach * turns) + ROUND_OFF * self._grid.cell_size
+        ways = (1.0 + ROUND_OFF) * (steps + self.reach * turns) + ROUND_OFF * self._cell_size
         return np.append(np.cumsum(ways[::-1])[::-1], 0.0)
 
     def _window(
-        self, pose: Motion, shape: Index3, offset: NDArray[np.float64]
+        self, grid: SmokeGrid, pose: Motion, shape: Index3, offset: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The first place within the shape's box along each axis, from 0, and the first one after it."""
-        solid = PlacedSolid(self._solid.shape, self._solid.scale, rotation.matrices(pose.orientation), pose.position)
-        lower, upper = (solid.bounds - self._grid.origin) / self._grid.cell_size - offset
+        lower, upper = (self.bounds(pose) - grid.origin) / grid.cell_size - offset
         low = np.clip(np.ceil(lower), 0, shape).astype(np.int64)
         return low, np.clip(np.floor(upper) + 1, low, shape).astype(np.int64)
 
-    def _positions(self, places: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        positions: NDArray[np.float64] = np.asarray(self._grid.origin) + (places + offset) * self._grid.cell_size
-        return positions
+
+def _positions(grid: SmokeGrid, places: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    positions: NDArray[np.float64] = np.asarray(grid.origin) + (places + offset) * grid.cell_size
+    return positions

@@ -46,7 +46,7 @@ def thin_walls(
     What lies on a closed side counts as seen, and so does what has a corner in another body, which stands still as
     well, right beside it.
     """
-    low, high = (np.asarray(corner) for corner in smoke.corners(domain))
+    low, high = (np.asarray(corner) for corner in smoke.limits(domain))
     # A face that lies in a side of the box, but for round-off, is not in it.
     points, inwards = _probes(solid, (low + WHOLE * smoke.cell_size, high - WHOLE * smoke.cell_size))
     depth = _thickness(solid, points, inwards, smoke.cell_size)
@@ -112,8 +112,8 @@ def _has_corner(
     solids: Sequence[Solid], points: Points, inwards: Points, smoke: SmokeParameters, domain: DomainParameters
 ) -> NDArray[np.bool_]:
     """Whether the row of corners at each point has one in a body, or ends right there at a closed side, (n,)."""
-    low, high = (np.asarray(corner) for corner in smoke.corners(domain))
-    found = _row(solids, points, inwards, low, smoke.cell_size)
+    low, high = (np.asarray(corner) for corner in smoke.limits(domain))
+    found = _row(solids, points, inwards, np.asarray(smoke.corners(domain)[0]), smoke.cell_size)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
     for side, beside in (("-", points - low < smoke.cell_size), ("+", high - points < smoke.cell_size)):
         closed = np.array([f"{name}{side}" not in smoke.open_faces for name in "xyz"])

@@ -37,6 +37,7 @@ TINY = {
     "smoke_in_box": {"smoke.plume.cell_size": 0.016},
     "smoke_moving_duck": {"smoke.fog.cell_size": 0.06},
     "smoke_past_sphere": {"smoke.smoke.cell_size": 0.02},
+    "train": {"smoke.smoke.cell_size": 0.26},
     "water_mill": {"fluid.water.particle_radius": 0.0075},
     "wine_glass": {"fluid.wine.particle_radius": 0.002},
 }

@@ -2,14 +2,14 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.closed_domain import check_closed_domain
-from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.checks.memory_budget import MemoryBudget, memory_budget
 from pipeline.kinds.checks.smoke_bodies import (
     LEAST_LAYERS,
     GeometryBuilder,
@@ -18,6 +18,7 @@ from pipeline.kinds.checks.smoke_bodies import (
     geometry_builder,
     static_bodies,
 )
+from pipeline.kinds.sizes import expected_cells
 from pipeline.model.amounts import count, gigabytes, rounded_down, rounded_up
 from pipeline.model.boxes import ALL, Box, overlap, smoke_box, span, touch
 from pipeline.model.job import Job
@@ -59,6 +60,8 @@ def check_smokes(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
     for index, smoke in enumerate(job.smoke):
         more_cells, more_bytes = _check_size(job, index, budget, (cells, size_bytes), findings)
         cells, size_bytes = cells + more_cells, size_bytes + more_bytes
+        if smoke.grid != "box":
+            _check_first_window(job, index, solids, budget, findings)
         standing = _check_in_cells(job, index, solids, geometry_of, findings)
         check_mesh_grids(job, smoke, solids, geometry_of, findings)
         _check_air(job, smoke, index, standing, findings)
@@ -138,6 +141,9 @@ def _check_size(
     layers = np.ceil(extent / smoke.cell_size)
     cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, on_gpu=budget.on_gpu)
     cells_before, bytes_before = before
+    if smoke.grid != "box":
+        # Nobody knows how large its window gets: the job pauses should it outgrow the memory.
+        return int(expected_cells(smoke, job.domain)), min(size_bytes, max(0.0, budget.bytes - bytes_before))
     if size_bytes + bytes_before > budget.bytes:
         room = max(0.0, budget.bytes - bytes_before)
         size = _cell_size_that_fits(extent, smoke.cell_size, room, on_gpu=budget.on_gpu)
@@ -158,11 +164,41 @@ def _check_size(
     return int(cells), size_bytes
 
 
+def _check_first_window(job: Job, index: int, solids: Solids, budget: MemoryBudget, findings: Findings) -> None:
+    """Note sources that lie so far apart that no window around them fits."""
+    smoke = job.smoke[index]
+    paths: list[KeyPath] = [("smoke", index, "source", number) for number in range(len(smoke.source))]
+    bounds = [solids[path].bounds for path in paths if path in solids]
+    if not bounds:
+        return
+    ends = np.clip([np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]], *smoke.limits(job.domain))
+    layers = np.ceil((ends[1] - ends[0]) / smoke.cell_size)
+    size_bytes = _bytes_of(layers, on_gpu=budget.on_gpu)
+    if size_bytes > budget.bytes:
+        findings.error(
+            ("smoke", index, "grid"),
+            f"{count(float(np.prod(layers)))} cells lie in one window around all sources, and need "
+            f"{gigabytes(size_bytes)}; {budget.owner} has {gigabytes(budget.bytes)}; give sources that are far apart a "
+            "smoke each, or use a larger cell_size",
+        )
+
+
 def _bytes_of(layers: NDArray[np.float64], *, on_gpu: bool) -> float:
     """Upper bound of the memory of a box of so many cells along x, y, z."""
     rows = float(layers[0] * layers[1])
     cells = float(np.prod(layers))
     return cells * BYTES_PER_CELL_ON_GPU + rows * BYTES_PER_ROW_ON_GPU if on_gpu else cells * BYTES_PER_CELL
+
+
+def growth_refusal(job: Job) -> Callable[[float], str | None]:
+    """A function that says why there is no memory, then, for so many more cells of smoke; None if there is."""
+
+    def refusal(more: float) -> str | None:
+        budget = memory_budget(job)
+        each = BYTES_PER_CELL_ON_GPU if budget.on_gpu else BYTES_PER_CELL
+        return budget.refusal(more, "more", float(each))
+
+    return refusal
 
 
 def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: float, *, on_gpu: bool) -> float:
@@ -181,6 +217,8 @@ def _check_wind(job: Job, smoke: SmokeParameters, path: KeyPath, standing: Seque
     """Note wind that has no way out of the box, or past static bodies; the latter in small grids only."""
     if problem := smoke.wind_problem():
         findings.error((*path, "wind"), problem)
+        return
+    if smoke.grid == "open":
         return
     low, high = smoke_box(smoke, job.domain)
     is_too_large = math.prod(np.ceil((high - low) / smoke.cell_size).tolist()) > COUNTED_CELLS
@@ -271,7 +309,7 @@ def _check_place(job: Job, path: KeyPath, solids: Solids, standing: Sequence[Sol
     smoke, solid = job.smoke[int(path[1])], solids[path]
     source = smoke.source[int(path[3])]
     body = next((each for each in job.rigid if each.name == source.follow), None)
-    box = smoke_box(smoke, job.domain)
+    box = np.array(smoke.limits(job.domain))
     if body is not None and body.kind == "dynamic":
         pass  # nobody knows where it gets
     elif source.keyframe or (body is not None and body.kind == "kinematic"):
@@ -286,14 +324,14 @@ def _check_place(job: Job, path: KeyPath, solids: Solids, standing: Sequence[Sol
 def _check_source(job: Job, path: KeyPath, solid: Solid, standing: Sequence[Solid], findings: Findings) -> None:
     """A source that stays must be in the box and have cells of its own."""
     smoke = job.smoke[int(path[1])]
-    box, cell_size = smoke_box(smoke, job.domain), smoke.cell_size
+    box, cell_size = np.array(smoke.limits(job.domain)), smoke.cell_size
     inside = overlap(solid.bounds, box)
     if inside == 0.0:
         findings.error(path, f"is wholly outside the smoke's grid: it spans {span(solid.bounds)}, not {span(box)}")
         return
     if inside < ALL:
         findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
-    centres = _centres_inside(solid, box, cell_size)
+    centres = _centres_inside(solid, box, smoke_box(smoke, job.domain)[0], cell_size)
     if centres is not None and len(centres) == 0:
         thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
         findings.error(
@@ -309,17 +347,20 @@ def _check_source(job: Job, path: KeyPath, solid: Solid, standing: Sequence[Soli
             findings.error(path, "lies wholly inside solid bodies, so it emits nothing; move it")
 
 
-def _centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:
-    """Centres of cells that a solid contains [m], (n, 3); None if there are too many cells around it."""
+def _centres_inside(
+    solid: Solid, box: Box, corner: NDArray[np.float64], cell_size: float
+) -> NDArray[np.float64] | None:
+    """Centres of cells in a box that a solid contains [m], (n, 3); None if there are too many cells around it.
+
+    Some cell has a corner at `corner` [m].
+    """
     low = np.maximum(solid.bounds[0], box[0])
     high = np.minimum(solid.bounds[1], box[1])
-    first = np.ceil((low - box[0]) / cell_size - 0.5)
-    last = np.floor((high - box[0]) / cell_size - 0.5)
+    first = np.ceil((low - corner) / cell_size - 0.5)
+    last = np.floor((high - corner) / cell_size - 0.5)
     if np.prod(np.maximum(last - first + 1.0, 0.0)) > COUNTED_CELLS:
         return None
-    axes = [
-        corner + (np.arange(a, b + 1.0) + 0.5) * cell_size for corner, a, b in zip(box[0], first, last, strict=True)
-    ]
+    axes = [start + (np.arange(a, b + 1.0) + 0.5) * cell_size for start, a, b in zip(corner, first, last, strict=True)]
     centres: NDArray[np.float64] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside: NDArray[np.float64] = centres[solid.signed_distance(centres) < 0.0] if len(centres) else centres
     return inside

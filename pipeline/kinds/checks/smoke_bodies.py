@@ -18,7 +18,7 @@ from sim.coupling.smoke_reach import can_come, too_thin_bodies
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.placement import PlacedSolid
 from sim.shapes.solid import ShapeError
-from sim.smoke.grid import SmokeGrid
+from sim.smoke.grid import SmokeGrid, Window
 from sim.smoke.parameters import MOST_CELLS, SmokeParameters
 from sim.smoke.thin_walls import ThinWalls, thin_walls, thin_walls_on_the_way
 
@@ -52,7 +52,7 @@ def check_bodies_in_smoke(
         return set()
     _check_moving_bodies(job, smoke, solids, geometry_of, findings)
     standing = static_bodies(job, solids)
-    box = smoke_box(smoke, job.domain)
+    box = np.array(smoke.limits(job.domain))
     inside = [number for number, solid in standing.items() if touch(solid.bounds, box, margin=0.0)]
     return {number for number in inside if not _has_cells(job, smoke, number, standing, findings)}
 
@@ -70,7 +70,7 @@ def _has_grid(smoke: SmokeParameters, domain: DomainParameters) -> bool:
     """Whether a smoke's box has as many cells as it may; if not, the check of its size tells."""
     box = smoke_box(smoke, domain)
     is_large_enough = np.all(box[1] - box[0] >= LEAST_LAYERS * smoke.cell_size)
-    return bool(is_large_enough and math.prod(smoke.cell_counts(domain)) <= MOST_CELLS)
+    return bool(is_large_enough and (smoke.grid != "box" or math.prod(smoke.cell_counts(domain)) <= MOST_CELLS))
 
 
 def _has_cells(
@@ -78,7 +78,8 @@ def _has_cells(
 ) -> bool:
     """Whether a static body has a cell in a smoke's grid; notes one that has none, or through which air passes."""
     solid = standing[number]
-    if SmokeGrid.of_box(smoke, job.domain).misses(solid):
+    window = None if smoke.grid == "box" else Window.around(solid.bounds, smoke, job.domain)
+    if SmokeGrid.of_box(smoke, job.domain, window).misses(solid):
         thinnest = float(np.ptp(solid.bounds, axis=0).min())
         findings.error(
             ("rigid", number),

@@ -22,7 +22,7 @@ _GPU_ERROR = re.compile(
     re.IGNORECASE,
 )
 """How Taichi, Cycles and drivers say that a GPU does not go on; their words for its memory are out_of_memory's."""
-_DIVERGED = "SimulationDivergedError"
+_TOLD = {"SimulationDivergedError": FailureKind.DIVERGED, "OutgrownError": FailureKind.OUTGROWN}
 _NO_DEVICE = "DeviceUnavailableError"
 _BLENDER_LOST = ("BlenderDiedError", "BlenderKilledError")
 """By name: asking isinstance would import the simulation and the renderer into every process."""
@@ -35,8 +35,9 @@ def classify(error: BaseException) -> FailureKind:
             return FailureKind.OUT_OF_MEMORY
         if _means_disk_full(link):
             return FailureKind.DISK_FULL
-        if _is_called(_DIVERGED, link):
-            return FailureKind.DIVERGED
+        for name, kind in _TOLD.items():
+            if _is_called(name, link):
+                return kind
         lost_device = _is_called(_NO_DEVICE, link) and getattr(link, "device", "cpu") != "cpu"
         if lost_device or (isinstance(link, RuntimeError) and means_gpu_error(str(link))):
             return FailureKind.GPU_ERROR
@@ -47,7 +48,7 @@ def classify(error: BaseException) -> FailureKind:
 
 def describe(error: BaseException) -> str:
     """One line for the user: our own errors are sentences already, others need their type's name; then their notes."""
-    if isinstance(error, PipelineError) or _is_called(_DIVERGED, error):
+    if isinstance(error, PipelineError) or any(_is_called(name, error) for name in _TOLD):
         sentence = str(error)
     else:
         sentence = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -142,12 +142,16 @@ def test_a_task_that_somebody_else_stopped_is_started_again():
     assert started(scheduler.handle(Tick(60.0))) == ["simulate"]
 
 
-def test_a_full_disk_pauses_the_job_and_fails_nothing():
+@pytest.mark.parametrize(
+    ("kind", "ending"),
+    [(FailureKind.DISK_FULL, JobOutcome.DISK_FULL), (FailureKind.OUTGROWN, JobOutcome.OUTGROWN)],
+)
+def test_a_full_disk_or_memory_that_is_outgrown_pauses_the_job_and_fails_nothing(kind, ending):
     tasks = film(2)
     scheduler = begun(tasks)
     commit(scheduler, "simulate", "cache/0")
-    assert fail(scheduler, "surface/0", FailureKind.DISK_FULL) == [Stop(TaskId("simulate"))]
-    assert outcome(fail(scheduler, "simulate", FailureKind.CANCELLED)) is JobOutcome.DISK_FULL
+    assert fail(scheduler, "surface/0", kind) == [Stop(TaskId("simulate"))]
+    assert outcome(fail(scheduler, "simulate", FailureKind.CANCELLED)) is ending
     assert {state for _, state in scheduler.counts()} == {TaskState.CANCELLED}
 
 
@@ -264,7 +268,8 @@ def test_random_events_never_break_an_invariant(jobs, seed, faults, ending):
         task_id = chance.choice(sorted(running))
         if chance.random() < faults:
             del running[task_id]
-            kinds = [kind for kind in FailureKind if kind is not FailureKind.DISK_FULL or chance.random() < 0.1]
+            pauses = {FailureKind.DISK_FULL, FailureKind.OUTGROWN}
+            kinds = [kind for kind in FailureKind if kind not in pauses or chance.random() < 0.1]
             instructions = fail(scheduler, task_id, chance.choice(kinds), now)
         elif running[task_id] and chance.random() < 0.2 and len(running[task_id]) == len(by_id[task_id].outputs):
             committed.update(running.pop(task_id))

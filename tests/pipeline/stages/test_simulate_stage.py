@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from simulation_on_a_full_disk import FRAMES as FRAMES_OF_FULL_DISK
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import FailureKind
+from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.store.artifacts import sweep_parts
 from pipeline.store.cache import Checkpoint, read_frame, write_checkpoint, write_frame
@@ -95,6 +97,10 @@ shape = {{ type = "sphere", radius = 0.15 }}
 position = [0.05, 0.0, 0.3]
 """
 """Its frames are rounded, and end around the smoke: continuing from them instead of a checkpoint would show."""
+
+
+RISING = PLUME.replace("cell_size = 0.0625", 'cell_size = 0.0625\ngrid = "open"\nbuoyancy_temperature = 0.2')
+"""It outgrows its box."""
 
 
 def simulate(layout: JobLayout, *, frames: int, attempt: int = 1, job: str = JOB) -> TaskEvent:
@@ -246,6 +252,26 @@ def test_a_disk_that_is_full_for_a_frame_is_told_as_such(layout: JobLayout, monk
     assert ended.message.endswith("; while frame 2 was written")
     assert not list(layout.checkpoints.glob("*.h5"))  # it would be ahead of the frames
     assert isinstance(simulate(layout, frames=6, attempt=2), Finished)
+
+
+def test_a_smoke_that_outgrows_memory_ends_at_its_last_frame_and_goes_on_where_there_is_more(
+    layout: JobLayout, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole = JobLayout(tmp_path / "whole")
+    assert isinstance(simulate(whole, frames=40, job=RISING), Finished)
+    with monkeypatch.context() as small_machine:
+        small = MemoryBudget(20_000, "this machine")
+        small_machine.setattr("pipeline.kinds.checks.smoke.memory_budget", lambda _job: small)
+        ended = simulate(layout, frames=40, job=RISING)
+    assert isinstance(ended, Failed)
+    assert ended.kind is FailureKind.OUTGROWN
+    numbers = r'smoke "plume" grows at [0-9.]+ s from [0-9,]+ to [0-9,]+ cells: [0-9,]+ more need .* at most 53 fit'
+    assert re.fullmatch(numbers, ended.message), ended.message
+    reached = len(list(layout.path(layout.frame_cache(0)).parent.glob("[0-9]*.h5")))
+    assert 1 < reached < 40
+    assert [path.stem for path in layout.checkpoints.glob("*.h5")] == [f"{reached - 1:06d}"]
+    assert isinstance(simulate(layout, frames=40, attempt=2, job=RISING), Finished)
+    assert frames_of(layout, 40) == frames_of(whole, 40)
 
 
 def test_a_checkpoint_that_meets_a_full_disk_leaves_nothing_of_it(

@@ -96,6 +96,29 @@ def test_a_volume_holds_what_the_cache_holds_where_it_is(layout):
     assert volume.centre == pytest.approx((-0.975, -1.075, 0.025), abs=1e-12)
 
 
+def test_a_window_of_a_smoke_lies_where_it_is_and_takes_the_room_of_its_own(layout):
+    """Whatever part of the box is computed, voxels are where the smoke is, and nothing else is in the files."""
+    whole = puff()
+    first = (24, 0, 16)
+    own = {name: np.ascontiguousarray(array[24:, :16, 16:]) for name, array in whole.arrays.items()}
+    x, y, z = (low + n * CELL_SIZE for low, n in zip((-1.0, -1.1, 0.0), first, strict=True))
+    window = Snapshot("smoke", own, {**whole.attributes, "origin": (x, y, z)})
+    places, sizes = [], []
+    for smoke in (whole, window):
+        assert isinstance(volume_of(layout, smoke, longest_shutter_s=1 / 60), Finished)
+        path = layout.path(layout.product("volumes", "plume", 1, ".vdb"))
+        (grid,) = (each for each in import_openvdb().readAll(str(path))[0] if each.name == "density")
+        voxels = {
+            tuple(np.round(grid.transform.indexToWorld(each.min), 9)): each.value for each in grid.citerOnValues()
+        }
+        places.append(voxels)
+        sizes.append(layout.path(layout.frame_cache(1)).stat().st_size)
+        path.unlink()
+    assert places[0] == places[1]
+    assert len(places[0]) == 5 * 4 * 11
+    assert sizes[1] < 1.02 * sizes[0]
+
+
 @pytest.mark.parametrize("field", ["density", "temperature", "velocity"])
 def test_values_that_are_not_finite_are_refused_with_frame_field_and_cell(layout, field):
     """They do not come out of the simulation; a frame may be from elsewhere."""

@@ -5,6 +5,7 @@ import re
 import pytest
 from checked_jobs import BALL, PLUME, checked, load_checked_job, says
 
+from pipeline.base.errors import JobFileError
 from pipeline.job.loading import read_job
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.smoke import check_smokes
@@ -202,6 +203,19 @@ def test_a_flat_box_on_a_gpu_counts_the_lanes_of_its_rows():
     # Four layers must remain, which is told as well; this is about memory.
     assert not [told for told in errors(size, on_gpu=True) if "need" in told]
     assert [told for told in errors(0.9 * size, on_gpu=True) if "need" in told]
+
+
+@pytest.mark.parametrize("grid", ["window", "open"])
+def test_a_window_needs_memory_for_its_sources_and_not_for_its_box(grid, tmp_path):
+    """Ten thousand cells along each edge of the box; the second source is 6 km away, where the window has no end."""
+    path = tmp_path / "fire.toml"
+    keys = f'grid = "{grid}"\n' + ("max = [500.0, 500.0, 500.0]\n" if grid == "window" else "")
+    path.write_text(with_keys(keys))
+    assert load_checked_job(path)[1].errors == []
+    far = SOURCE.replace("0.2]", "500.0]" if grid == "window" else "6000.0]").replace("[0.0,", "[490.0,", 1)
+    path.write_text(with_keys(keys.replace("500.0, 500.0, 500.0", "5000.0, 5000.0, 5000.0"), SOURCE + far))
+    with pytest.raises(JobFileError, match=r"cells lie in one window around all sources, and need .* a smoke each"):
+        load_checked_job(path)
 
 
 @pytest.mark.parametrize(("size", "expected"), [(0.12, 0.2), (0.2, 0.2), (0.5, 0.5)])

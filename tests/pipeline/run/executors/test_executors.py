@@ -37,6 +37,7 @@ from pipeline.run.executors.inline import InlineExecutor
 from pipeline.run.executors.processes import ProcessExecutor, WorkerLimits
 from render.blender import BlenderDiedError, FrameRenderError
 from sim.core.runtime import DeviceUnavailableError
+from sim.core.solver import OutgrownError
 
 __all__ = ["layout"]
 
@@ -315,6 +316,7 @@ def test_kills_for_want_of_memory_are_counted(tmp_path):
         (OSError(errno.EDQUOT, "quota"), FailureKind.DISK_FULL),
         (OSError("unable to write: error message = 'No space left on device'"), FailureKind.DISK_FULL),
         (FileNotFoundError(errno.ENOENT, "absent"), FailureKind.FAILED),
+        (OutgrownError("80 cells need more than there is"), FailureKind.OUTGROWN),
         (OSError(errno.ESTALE, "the server has started anew"), FailureKind.WORKER_LOST),
         (TimeoutError(errno.ETIMEDOUT, "the server does not answer"), FailureKind.WORKER_LOST),
         (TimeoutError("a task's own"), FailureKind.FAILED),
