@@ -14,7 +14,7 @@ from sim.core.hashed_numbers import hash_to_unit, smooth_noise, spread
 from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.motion import rotation
-from sim.shapes.placement import build_solid
+from sim.core.motion.paths import Motion
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid
 from sim.smoke.obstacles import Air, is_solid, part_before
@@ -42,35 +42,42 @@ class _Places:
     def __init__(self) -> None:
         self.count = 0
         self.indices = ti.ndarray(ti.i32, 1)
-        self.values = ti.ndarray(ti.f32, 1)
+        self.shares, self.speeds = ti.ndarray(ti.f32, 1), ti.ndarray(ti.f32, 1)
 
-    def put(self, indices: NDArray[np.int32], values: NDArray[np.float64] | float = 0.0) -> None:
-        """Take flat indices, (n,), and a value for each."""
+    def put(
+        self, indices: NDArray[np.int32], shares: NDArray[np.float64], speeds: NDArray[np.float64] | None = None
+    ) -> None:
+        """Take flat indices, covered parts [-] and, of faces, velocities [m/s], (n,) each."""
         self.count = len(indices)
         room = self.indices.shape[0]
         if self.count > room:
             room = max(self.count, 2 * room)
-            self.indices, self.values = ti.ndarray(ti.i32, room), ti.ndarray(ti.f32, room)
-        padded = np.zeros(room, np.int32), np.zeros(room, np.float32)
-        padded[0][: self.count], padded[1][: self.count] = indices, values
-        self.indices.from_numpy(padded[0])
-        self.values.from_numpy(padded[1])
+            self.indices, self.shares = ti.ndarray(ti.i32, room), ti.ndarray(ti.f32, room)
+            self.speeds = ti.ndarray(ti.f32, room)
+        for array, values in ((self.indices, indices), (self.shares, shares), (self.speeds, speeds)):
+            if values is not None:
+                padded = np.zeros(room, np.int32 if array is self.indices else np.float32)
+                padded[: self.count] = values
+                array.from_numpy(padded)
 
 
 class Source:
-    """One source on one grid: the open cells and faces whose centres lie inside it.
+    """One source on one grid: the open cells and faces, or parts of them, that it covers.
 
-    What an obstacle covers just now emits nothing. A source that moves emits where it is in any part of the step, so
-    that what it leaves behind in air at rest is its swept volume, however long the steps are.
+    A cell of which it covers a part is raised to that part of what whole ones are raised to, so that air at rest gets
+    the source's values times its volume, wherever it lies between cells. What an obstacle covers just now emits
+    nothing. A source that moves emits where it is in any part of the step, so that what it leaves behind in air at rest
+    is its swept volume, however long the steps are.
 
     Velocity is imposed before the projection, which may change it: a source drives the flow, it is no inlet. So it
-    never creates volume, and also blows in a closed box.
+    never creates volume, and also blows in a closed box. Faces get it by the covered part of the cell around them
+    (Fadlun et al. 2000, J. Comput. Phys. 161:35-60, section 2.3).
 
     Attributes:
         parameters: of the source.
         motion: how it moves; None if it stays.
         target_density, target_excess: what cells inside are raised to at full strength [-], [K above the air].
-        cell_count: how many cells outside of static solids lie inside; of a source that moves, in the last step.
+        cell_count: how many cells outside of static solids it covers a part of; if it moves, in the last step.
     """
 
     def __init__(
@@ -79,21 +86,19 @@ class Source:
         self.parameters = parameters
         self.target_density = parameters.density
         self.target_excess = parameters.temperature - ambient_temperature
-        self._grid, self._air = grid, air
+        self._grid, self._air, self._solid = grid, air, grid.pad(grid.solid).ravel()
         self._cells, self._faces = _Places(), [_Places() for _ in range(3)]
         self._emitted = ti.ndarray(ti.f32, 1)
         # Random numbers of other seeds are others; seed 0 leaves the key of a patch as it is.
         self._salt = int(np.uint32(spread(parameters.seed)).view(np.int32))
         self.motion: SourceMotion | None = None
+        self._shape = SweptShape(parameters, grid)
+        turn, velocity = rotation.from_degrees(parameters.rotation_deg), np.asarray(parameters.velocity or (0.0,) * 3)
+        self._own_velocity = rotation.rotated(rotation.conjugate(turn), velocity)
         if parameters.moves:
-            self._shape = SweptShape(parameters, grid)
             self.motion = motion_of(parameters, self._shape.reach)
-            start = np.asarray(parameters.velocity or (0.0, 0.0, 0.0))
-            self._own_velocity = rotation.rotated(
-                rotation.conjugate(rotation.from_degrees(parameters.rotation_deg)), start
-            )
         else:
-            self._stay()
+            self._cover([Motion(np.asarray(parameters.position, float), turn, np.zeros(3), np.zeros(3))])
 
     @property
     def cell_count(self) -> int:
@@ -119,7 +124,7 @@ class Source:
         """
         begin_s, end_s = self.parameters.span_of(time_s, time_s + dt)
         if self.motion is not None:
-            self._move(self.motion, begin_s, end_s)
+            self._cover(self.motion.poses(begin_s, end_s, spacing=self._grid.cell_size / POSES_PER_CELL))
         strength = self.parameters.largest_strength(begin_s, end_s) * self._steadiness(end_s)
         blocks = -(-max(1, self._cells.count) // BLOCK)
         if self._emitted.shape[0] < blocks:
@@ -127,25 +132,19 @@ class Source:
         noise = Noise(int(time_s * FLUCTUATION_RATE_HZ), self._salt, self.parameters.fluctuation)
         targets = ti.math.vec2(strength * self.target_density, strength * self.target_excess)
         is_hot, count = self.target_excess >= 0.0, self._cells.count
-        _raise_cells(self._air, self._cells.indices, count, noise, targets, is_hot, blocks, self._emitted)
+        cells = self._cells.indices, self._cells.shares
+        _raise_cells(self._air, *cells, count, noise, targets, is_hot, blocks, self._emitted)
         if self.parameters.velocity is not None:
             for faces, openness, velocity in zip(
                 self._faces, self._air.openness, self._air.state.velocity, strict=True
             ):
-                _set_faces(faces.indices, faces.values, openness, velocity, faces.count)
+                _set_faces(faces.indices, faces.shares, faces.speeds, openness, velocity, faces.count)
         return float(copied(self._emitted)[:blocks].sum(dtype=np.float64))
 
-    def _stay(self) -> None:
-        grid, region = self._grid, build_solid(self.parameters)
-        self._cells.put(_flat_indices(grid, grid.cells_inside(region) & ~grid.solid))
-        if self.parameters.velocity is not None:
-            for axis, speed in enumerate(self.parameters.velocity):
-                inside = grid.faces_inside(region, axis) & (grid.open_area[axis] > 0.0)
-                self._faces[axis].put(_flat_indices(grid, inside), speed)
-
-    def _move(self, motion: SourceMotion, begin_s: float, end_s: float) -> None:
-        poses = motion.poses(begin_s, end_s, spacing=self._grid.cell_size / POSES_PER_CELL)
-        self._cells.put(self._shape.covered(poses, CELLS).indices)
+    def _cover(self, poses: Sequence[Motion]) -> None:
+        swept = self._shape.covered(poses, CELLS)
+        is_air = ~self._solid[swept.indices]
+        self._cells.put(swept.indices[is_air], swept.shares[is_air])
         if self.parameters.velocity is None:
             return
         origins = np.stack([pose.position for pose in poses])
@@ -154,7 +153,7 @@ class Source:
         for axis, faces in enumerate(self._faces):
             swept = self._shape.covered(poses, axis)
             turning = rotation.cross(spins[swept.poses], swept.places - origins[swept.poses])
-            faces.put(swept.indices, (blown[swept.poses] + turning)[:, axis])
+            faces.put(swept.indices, swept.shares, (blown[swept.poses] + turning)[:, axis])
 
     def _steadiness(self, time_s: float) -> float:
         """What flickering leaves of its strength [-]."""
@@ -166,6 +165,7 @@ class Source:
 def _raise_cells(
     air: Air,
     cells: Integers,
+    shares: Floats,
     count: ti.i32,
     noise: Noise,
     targets: ti.math.vec2,
@@ -181,10 +181,10 @@ def _raise_cells(
             at = cells[n]
             if not is_solid(air.solids, at):
                 before = density[at]
-                after = ti.max(before, targets[0])
+                after = ti.max(before, shares[n] * targets[0])
                 density[at] = after
                 emitted += part_before(air.solids, at) * (after - before)
-                target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * targets[1]
+                target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * shares[n] * targets[1]
                 excess[at] = ti.max(excess[at], target) if ti.static(is_hot) else ti.min(excess[at], target)
         added[block] = emitted
 
@@ -202,18 +202,18 @@ def _fluctuate(box: Grid, at: ti.i32, noise: Noise):
 
 
 @kernel
-def _set_faces(faces: Integers, speeds: Floats, openness: Floats, velocity: Floats, count: ti.i32):
+def _set_faces(faces: Integers, shares: Floats, speeds: Floats, openness: Floats, velocity: Floats, count: ti.i32):
     for n in range(count):
-        if openness[faces[n]] > 0.0:
-            velocity[faces[n]] = speeds[n]
+        at = faces[n]
+        if openness[at] > 0.0:
+            velocity[at] = (1.0 - shares[n]) * velocity[at] + shares[n] * speeds[n]
 
 
 def build_sources(parameters: SmokeParameters, grid: SmokeGrid, air: Air) -> Sequence[Source]:
     """The sources of a smoke.
 
     Raises:
-        ValueError: a source that stays contains no open cell: it lies outside the box, in a solid, or is smaller than
-            a cell.
+        ValueError: a source that stays covers no open cell: it lies outside the box or in a solid.
     """
     sources = [
         Source(source, grid, air, ambient_temperature=parameters.ambient_temperature) for source in parameters.source
@@ -221,12 +221,7 @@ def build_sources(parameters: SmokeParameters, grid: SmokeGrid, air: Air) -> Seq
     for number, source in enumerate(sources):
         if source.motion is None and source.cell_count == 0:
             raise ValueError(
-                f'smoke "{parameters.name}", source {number}: no cell centre lies inside it; move it into the box '
-                f"from {grid.origin} to {grid.upper} m, out of solids, or make it larger than a cell "
-                f"of {grid.cell_size:g} m"
+                f'smoke "{parameters.name}", source {number}: it covers no cell; move it into the box '
+                f"from {grid.origin} to {grid.upper} m, and out of solids"
             )
     return sources
-
-
-def _flat_indices(grid: SmokeGrid, mask: NDArray[np.bool_]) -> NDArray[np.int32]:
-    return np.flatnonzero(grid.pad(mask)).astype(np.int32)
