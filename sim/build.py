@@ -84,7 +84,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     if cloths and scene.fluid:
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
     fluids = [_build_fluids(scene, static, rigid, samples, forces)] if scene.fluid else []
-    smokes = [_build_smoke(smoke, scene, static, forces) for smoke in scene.smoke]
+    smokes = [_build_smoke(smoke, scene, static, forces, 1.0 / frames_per_second) for smoke in scene.smoke]
     coupled: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
@@ -229,7 +229,11 @@ def _build_rigid(scene: SceneParameters, points: JointPoints | None, forces: For
 
 
 def _build_smoke(
-    smoke: SmokeParameters, scene: SceneParameters, static: Sequence[StaticBody], forces: ForceField | None
+    smoke: SmokeParameters,
+    scene: SceneParameters,
+    static: Sequence[StaticBody],
+    forces: ForceField | None,
+    frame_s: float,
 ) -> SmokeSolver:
     """The solver of one smoke, with static bodies in it, and room for what will move in it."""
     return SmokeSolver(
@@ -239,6 +243,7 @@ def _build_smoke(
         solids=[body.solid for body in static],
         moving=_meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
         forces=forces,
+        frame_s=frame_s,
     )
 
 

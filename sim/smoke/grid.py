@@ -30,6 +30,24 @@ LOWEST, CENTRE = (0.0, 0.0, 0.0), (0.5, 0.5, 0.5)  # corner and centre of a cell
 
 
 @dataclass(frozen=True)
+class Window:
+    """A part of a smoke's box that is computed, whole cells of it."""
+
+    first: Index3  # its lowest cell, counted from that of the box; negative where the box has no end
+    cells: Index3  # how many along x, y, z
+
+    def inner_faces(self, box: Index3) -> frozenset[Face]:
+        """Its sides that are not sides of a box of so many cells."""
+        faces: tuple[tuple[Face, Face], ...] = (("x-", "x+"), ("y-", "y+"), ("z-", "z+"))
+        return frozenset(
+            face
+            for pair, first, n, end in zip(faces, self.first, self.cells, box, strict=True)
+            for face, is_inner in zip(pair, (first != 0, first + n != end), strict=True)
+            if is_inner
+        )
+
+
+@dataclass(frozen=True)
 class SmokeGrid:
     """A box of cubic cells, its open sides and the solids in it that stand still.
 
@@ -42,12 +60,17 @@ class SmokeGrid:
     open_faces: frozenset[Face]  # sides of the box that air passes freely; the others are walls
     distance: NDArray[np.float32]  # of corners from these solids, (nx + 1, ny + 1, nz + 1), not beyond `FAR` [cells]
     inflow_faces: frozenset[Face] = frozenset()  # where wind comes in at a given speed; walls to the pressure
+    first: Index3 = (0, 0, 0)  # its lowest cell, counted from that of the smoke's box (`Window`)
 
     @classmethod
     def build(
-        cls, parameters: SmokeParameters, domain: DomainParameters, solids: Sequence[HasSignedDistance] = ()
+        cls,
+        parameters: SmokeParameters,
+        domain: DomainParameters,
+        solids: Sequence[HasSignedDistance] = (),
+        window: Window | None = None,
     ) -> SmokeGrid:
-        """The grid of a smoke: its own box, or the domain's where it names none.
+        """The grid of a smoke: its own box, or the domain's where it names none, or a window of that.
 
         A box that is no whole number of cells long is rounded up, keeping its lower corner.
 
@@ -62,7 +85,7 @@ class SmokeGrid:
                 )
         if problem := parameters.wind_problem():
             raise ValueError(f'smoke "{parameters.name}": wind {problem}')
-        empty = cls.of_box(parameters, domain)
+        empty = cls.of_box(parameters, domain, window)
         if not solids:
             return empty
         for region in solids:
@@ -78,11 +101,19 @@ class SmokeGrid:
         return grid
 
     @classmethod
-    def of_box(cls, parameters: SmokeParameters, domain: DomainParameters) -> SmokeGrid:
-        """The cells of a smoke's box, of which none is solid; the box must not be empty."""
+    def of_box(cls, parameters: SmokeParameters, domain: DomainParameters, window: Window | None = None) -> SmokeGrid:
+        """The cells of a smoke's box, or of a window, of which none is solid; the box must not be empty.
+
+        Where a window ends, and the box does not, air passes.
+        """
         cells, inflow = parameters.cell_counts(domain), frozenset(parameters.windward_faces)
-        is_open, lower = frozenset(parameters.open_faces) - inflow, parameters.min or domain.min
-        return cls.of_cells(lower, parameters.cell_size, cells, is_open, inflow)
+        is_open, lower = frozenset(parameters.open_faces), parameters.min or domain.min
+        if window is not None:
+            is_open |= window.inner_faces(cells)
+            x, y, z = (low + n * parameters.cell_size for low, n in zip(lower, window.first, strict=True))
+            lower, cells = (x, y, z), window.cells
+        grid = cls.of_cells(lower, parameters.cell_size, cells, is_open - inflow, inflow)
+        return grid if window is None else replace(grid, first=window.first)
 
     @classmethod
     def of_cells(
@@ -129,6 +160,11 @@ class SmokeGrid:
             outside |= (cell_corners(self.distance, corner) > 0.0).astype(np.int32) << corner
         solid: NDArray[np.bool_] = (outside == 0) | is_split(outside)
         return solid
+
+    @property
+    def window(self) -> Window:
+        """Which cells of the smoke's box it has."""
+        return Window(self.first, self.cells)
 
     @property
     def padded(self) -> Index3:

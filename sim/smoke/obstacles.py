@@ -38,6 +38,9 @@ class Mover(Protocol):
     def stable_dt(self) -> float:
         """Largest step [s] in which none of its solids gets farther than a cell in the box, as far as it can tell."""
 
+    def exchange(self, dt: float) -> None:
+        """Mark them where they are, at the end of a step of dt [s]."""
+
 
 def time_of_travel(distance: float, speed: float, acceleration: float) -> float:
     """Time t [s] in which nothing gets farther than a distance: v t + a t² = d; infinite at rest.

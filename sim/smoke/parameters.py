@@ -16,7 +16,7 @@ from sim.core.motion.parameters import (
     require_ascending_times,
     strength_at,
 )
-from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import BodyName, Fraction, KeyRefusedError, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
 
 WHOLE = 1.0e-6  # part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001
@@ -132,6 +132,11 @@ class SmokeParameters(Parameters):
     open_faces: Faces = Field(
         default=("x-", "x+", "y-", "y+", "z+"), description="Sides through which air and smoke may pass."
     )
+    grid: Literal["box", "window", "open"] = Field(
+        default="box",
+        description="Which cells are computed. box: all of its box. window: those around smoke, heat, sources and air "
+        "in motion, within the box. open: the same, and only closed sides end the box: it is as large as it needs.",
+    )
     ambient_temperature: Positive = Field(default=293.0, description="Temperature of the air [K].")
     buoyancy_density: NonNegative = Field(
         default=0.1, description="Weight alpha of the smoke: downward acceleration per density [m/s²]."
@@ -167,6 +172,14 @@ class SmokeParameters(Parameters):
     )
     projection_max_iterations: int = Field(default=100, ge=1, description="Most iterations of the projection [-].")
     cfl: Positive = Field(default=2.0, le=10.0, description="Most cells that smoke may cross in a substep [-].")
+
+    @model_validator(mode="after")
+    def _has_open_sides(self) -> Self:
+        if self.grid == "open" and not self.open_faces:
+            raise KeyRefusedError(
+                ("grid",), '"open" has no meaning where all sides are walls; name some in open_faces, or leave it out'
+            )
+        return self
 
     @property
     def hottest_excess(self) -> float:

@@ -20,7 +20,7 @@ from sim.smoke.advection import Advection
 from sim.smoke.arrays import new_state
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import accelerate, cool, upward
-from sim.smoke.grid import SmokeGrid
+from sim.smoke.grid import Index3, SmokeGrid, Window
 from sim.smoke.lanes import lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air, AirForce, Obstacles, time_of_travel
 from sim.smoke.outer_forces import OuterForces
@@ -28,9 +28,10 @@ from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection, ProjectionReport
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 from sim.smoke.sides import blow_in, brake_inflow, start_wind
-from sim.smoke.sources import build_sources
+from sim.smoke.sources import require_cells, sources_of
 from sim.smoke.transport import Transport
 from sim.smoke.turbulence import Turbulence
+from sim.smoke.window import Fitting, carry_over
 
 RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed of sound [m/s]
 
@@ -79,12 +80,38 @@ class SmokeSolver:
         solids: Sequence[HasSignedDistance] = (),
         moving: bool = False,
         forces: ForceField | None = None,
+        frame_s: float = 1.0 / 24.0,
     ) -> None:
-        """Take a smoke, which may have the domain for its box, static solids, and room for obstacles that move."""
+        """Take a smoke, which may have the domain for its box, static solids, and room for obstacles that move.
+
+        A window is fitted to frames of `frame_s` [s].
+        """
         self.name = parameters.name
         self.parameters = parameters
-        self.grid = SmokeGrid.build(parameters, domain, solids)
+        self.sources = sources_of(parameters)
+        self.air_forces: list[AirForce] = []
+        self._gravity, self._has_gravity = gravity, any(upward(gravity))
+        self._lift = parameters.lift_per_kelvin(gravity)
+        self._domain, self._solids, self._outer = domain, solids, (forces or ForceField(())).on([(self.name,)])
+        self._frame_s, self._fitting = frame_s, Fitting(parameters, domain, frame_s)
+        window = self._fitting.first(source.bounds(0.0, 0.0) for source in self.sources)
+        self.grid = SmokeGrid.build(parameters, domain, solids, window)
         self.obstacles = Obstacles(self.grid, moving=moving)
+        self._compute_in_grid()
+        require_cells(parameters, self.sources, self.grid)
+        self._emitted_mass = 0.0
+        self.begin_frame(0.0)
+        if any(parameters.wind):
+            if cut_off := self.grid.cut_off_faces():
+                raise ValueError(f'smoke "{self.name}": wind {parameters.cut_off_problem(cut_off)}')
+            start_wind(self.air, parameters.wind, parameters.windward_faces)
+            self._projections.append(self._projection.project())
+            self._extrapolation.fill()
+            self.begin_frame(0.0)
+
+    def _compute_in_grid(self) -> None:
+        """Have room for air at rest in the grid, and all that changes it."""
+        parameters = self.parameters
         self.state = new_state(self.grid.size)
         self._projection = PressureProjection(
             self.obstacles,
@@ -103,27 +130,38 @@ class SmokeSolver:
         )
         self._transport = Transport(self.air, work, sharpens=parameters.advection == "maccormack")
         self._open_sides = self.grid.open_sides
-        self._gravity, self._has_gravity = gravity, any(upward(gravity))
-        self._lift = parameters.lift_per_kelvin(gravity)
         self._extrapolation = Extrapolation(self.obstacles, self.state.velocity, work[:3], reach=parameters.cfl)
         self._rows = new_rows(self.air.box)
-        self.sources = build_sources(parameters, self.grid, self.air)
+        for source in self.sources:
+            source.enter(self.grid)
         self._turbulence: Turbulence | None = None
         if parameters.turbulence.strength > 0.0:
             self._turbulence = Turbulence(self.grid, parameters.turbulence, parameters.wind)
-        outer = (forces or ForceField(())).on([(self.name,)])
-        self.air_forces: list[AirForce] = []
-        if outer.accelerates or outer.blows:
-            self.air_forces.append(OuterForces(outer, self.air, parameters, self.grid))
-        self._emitted_mass = 0.0
-        self.begin_frame(0.0)
-        if any(parameters.wind):
-            if cut_off := self.grid.cut_off_faces():
-                raise ValueError(f'smoke "{self.name}": wind {parameters.cut_off_problem(cut_off)}')
-            start_wind(self.air, parameters.wind, parameters.windward_faces)
-            self._projections.append(self._projection.project())
-            self._extrapolation.fill()
-            self.begin_frame(0.0)
+        if self._outer.accelerates or self._outer.blows:
+            self.air_forces.append(OuterForces(self._outer, self.air, parameters, self.grid))
+
+    def _move_window(self, window: Window) -> None:
+        """Compute in another window from now on: what it shares with the present one stays, else there is fresh air."""
+        if window == self.grid.window:
+            return
+        state, grid, box, moving = self.state, self.grid, self.obstacles.box, self.obstacles.moving
+        movers = self.obstacles.movers
+        self.air_forces.clear()
+        # All but the state is given up before there is more.
+        del self._projection, self._advection, self._transport, self._extrapolation, self._turbulence, self._rows
+        del self.air, self.obstacles
+        empty = SmokeGrid.of_box(self.parameters, self._domain, window)
+        self.grid = empty.with_solids(self._solids) if self._solids else empty
+        self.obstacles = Obstacles(self.grid, moving=moving)
+        self.obstacles.movers += movers
+        self._compute_in_grid()
+        if any(self.parameters.wind):
+            start_wind(self.air, self.parameters.wind, self.parameters.windward_faces)
+        carry_over(state, (grid, box), self.state, (self.grid, self.obstacles.box))
+        for mover in movers:
+            mover.exchange(0.0)
+        self.move_obstacles()
+        self._extrapolation.fill()
 
     @property
     def _arrays(self) -> dict[str, ti.Ndarray]:
@@ -169,9 +207,13 @@ class SmokeSolver:
             self._follow_obstacles()
 
     def begin_frame(self, time_s: float) -> None:
-        """A frame starts at simulated time `time_s` [s]."""
+        """A frame starts at simulated time `time_s` [s]; a window is fitted to what is there."""
         self.time_s = time_s
         self._projections: list[ProjectionReport] = []
+        if self._fitting.follows:
+            frame = time_s, time_s + self._frame_s
+            emitting = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
+            self._move_window(self._fitting.next(self.grid.window, self.air, emitting, self._rows))
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Density, temperature and velocity at cell centres; solid cells hold no smoke."""
@@ -207,7 +249,8 @@ class SmokeSolver:
         """The state with its ghosts, the obstacles that move, the time and the counted masses."""
         arrays = {name: values.to_numpy().reshape(self.grid.padded) for name, values in self._arrays.items()}
         clock = np.array([self.time_s, self._emitted_mass])
-        return {**arrays, **self.obstacles.checkpoint(), "clock": clock}
+        window = {"window": np.array([self.grid.first, self.grid.cells])} if self._fitting.follows else {}
+        return {**arrays, **self.obstacles.checkpoint(), **window, "clock": clock}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -215,6 +258,9 @@ class SmokeSolver:
         Raises:
             ValueError: an array is missing or has another shape.
         """
+        if self._fitting.follows:
+            first, cells = _window_in(arrays, self.name)
+            self._move_window(Window(first, cells))
         moving = ["obstacles"] if self.obstacles.moving else []
         expected = {**dict.fromkeys([*self._arrays, *moving], self.grid.padded), "clock": (2,)}
         for name, shape in expected.items():
@@ -248,6 +294,8 @@ class SmokeSolver:
             "divergence": max((report.divergence for report in self._projections), default=0.0),
             "not_converged": float(sum(not report.converged for report in self._projections)),
         }
+        if self._fitting.follows:
+            numbers["cells"] = float(np.prod(self.grid.cells))
         if self.obstacles.moving:
             numbers["compression"] = max((report.compression for report in self._projections), default=0.0)
         return numbers
@@ -278,7 +326,7 @@ class SmokeSolver:
     def _emit(self, dt: float) -> None:
         for source in self.sources:
             if source.parameters.emits_during(self.time_s, self.time_s + dt):
-                self._emitted_mass += source.emit(self.time_s, dt) * self.grid.cell_size**3
+                self._emitted_mass += source.emit(self.air, self.time_s, dt) * self.grid.cell_size**3
 
     def _follow_obstacles(self) -> None:
         self._projection.update()
@@ -301,6 +349,15 @@ class SmokeSolver:
         beta = self._lift if self._has_gravity else 0.0
         speed, acceleration = _find_speed_and_acceleration(self.air, alpha, beta, self._rows)
         return speed, acceleration
+
+
+def _window_in(arrays: Arrays, name: str) -> tuple[Index3, Index3]:
+    """First cell and cells of the window of a checkpoint. Raises ValueError when it has none."""
+    window = arrays.get("window")
+    if window is None or window.shape != (2, 3) or (window[1] < 1).any():
+        raise ValueError(f'checkpoint of smoke "{name}": window must be two cells, got {window}')
+    (a, b, c), (d, e, f) = window.tolist()
+    return (a, b, c), (d, e, f)
 
 
 @kernel

@@ -153,33 +153,37 @@ class SweptShape:
         reach: largest distance of its points from its origin [m].
     """
 
-    def __init__(self, placement: Placement, grid: SmokeGrid) -> None:
-        """Build the shape; where it stands does not matter.
+    def __init__(self, placement: Placement, cell_size: float) -> None:
+        """Build the shape for grids of this cell size [m]; where it stands does not matter.
 
         Raises:
             ShapeError: it cannot be built.
         """
         placed = build_solid(placement)
-        self._grid = grid
+        self._cell_size = cell_size
         self._solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
         self.reach = float(np.linalg.norm(np.abs(self._solid.bounds).max(axis=0)))
         self._distance = self._solid.signed_distance
         self._is_exact = not isinstance(placement.shape, COSTLY_SHAPES)
         if not self._is_exact:
-            spacing = grid.cell_size / LOOKUPS_PER_CELL
+            spacing = cell_size / LOOKUPS_PER_CELL
             self._distance = LevelSet.sample(self._solid, spacing, exact_within=2.0 * spacing).signed_distance
         steps = (np.arange(PARTS) + 0.5) / PARTS - 0.5
         points = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-        self._points = grid.cell_size * points  # about the middle of a cell [m], (PARTS³, 3)
+        self._points = cell_size * points  # about the middle of a cell [m], (PARTS³, 3)
         # Farther from the surface than this a cell is covered whole, or not at all.
-        self._margin = grid.cell_size * (0.5 * math.sqrt(3.0) + 0.5 / PARTS)
+        self._margin = cell_size * (0.5 * math.sqrt(3.0) + 0.5 / PARTS)
 
-    def covered(self, poses: Sequence[Motion], axis: int) -> Swept:
-        """The faces across an axis, or the `CELLS`, that it covers a part of in one of the poses at least."""
-        grid = self._grid
+    def bounds(self, pose: Motion) -> Array:
+        """Corners of the box around the shape in a pose [m], (2, 3)."""
+        turned = rotation.matrices(pose.orientation)
+        return PlacedSolid(self._solid.shape, self._solid.scale, turned, pose.position).bounds
+
+    def covered(self, grid: SmokeGrid, poses: Sequence[Motion], axis: int) -> Swept:
+        """The faces of a grid across an axis, or the `CELLS`, that it covers a part of in one of the poses."""
         shape: Index3 = grid.cells if axis == CELLS else grid.face_shape(axis)
         offset = np.array([0.0 if a == axis else 0.5 for a in range(3)])
-        windows = [self._window(pose, shape, offset) for pose in poses]
+        windows = [self._window(grid, pose, shape, offset) for pose in poses]
         first = np.min([low for low, _ in windows], axis=0)
         size = np.maximum(np.max([high for _, high in windows], axis=0) - first, 0)
         last, shares = np.full(size, -1, np.int64), np.zeros(size)
@@ -197,7 +201,7 @@ class SweptShape:
             asked = np.nonzero((shares[window] < 1.0) & (free_until[window] <= ways[number]))
             if len(asked[0]) == 0:
                 continue
-            places = self._positions(np.stack(asked, axis=-1) + low, offset)
+            places = _positions(grid, np.stack(asked, axis=-1) + low, offset)
             distance = self._distances(pose, places)
             if self._is_exact:
                 free_until[window][asked] = ways[number] + distance - self._margin
@@ -225,7 +229,7 @@ class SweptShape:
         padded = grid.padded
         flat = ((indices[:, 0] + 1) * padded[1] + indices[:, 1] + 1) * padded[2] + indices[:, 2] + 1
         is_covered = last >= 0
-        return Swept(flat.astype(np.int32), shares[is_covered], self._positions(indices, offset), last[is_covered])
+        return Swept(flat.astype(np.int32), shares[is_covered], _positions(grid, indices, offset), last[is_covered])
 
     def _distances(self, pose: Motion, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distances [m] of positions (n, 3) from the shape in a pose, (n,)."""
@@ -237,19 +241,19 @@ class SweptShape:
         turned = np.stack([rotation.matrices(pose.orientation) for pose in poses])
         steps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
         turns = np.linalg.norm(np.diff(turned, axis=0), axis=(1, 2)) / math.sqrt(2.0)
-        ways = (1.0 + ROUND_OFF) * (steps + self.reach * turns) + ROUND_OFF * self._grid.cell_size
+        ways = (1.0 + ROUND_OFF) * (steps + self.reach * turns) + ROUND_OFF * self._cell_size
         return np.append(np.cumsum(ways[::-1])[::-1], 0.0)
 
     def _window(
-        self, pose: Motion, shape: Index3, offset: NDArray[np.float64]
+        self, grid: SmokeGrid, pose: Motion, shape: Index3, offset: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The first place along each axis, from 0, that may be covered in part, and the first one after the last."""
-        solid = PlacedSolid(self._solid.shape, self._solid.scale, rotation.matrices(pose.orientation), pose.position)
         margin = 0.5 + 0.5 / PARTS
-        lower, upper = (solid.bounds - self._grid.origin) / self._grid.cell_size - offset
+        lower, upper = (self.bounds(pose) - grid.origin) / grid.cell_size - offset
         low = np.clip(np.ceil(lower - margin), 0, shape).astype(np.int64)
         return low, np.clip(np.floor(upper + margin) + 1, low, shape).astype(np.int64)
 
-    def _positions(self, places: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        positions: NDArray[np.float64] = np.asarray(self._grid.origin) + (places + offset) * self._grid.cell_size
-        return positions
+
+def _positions(grid: SmokeGrid, places: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    positions: NDArray[np.float64] = np.asarray(grid.origin) + (places + offset) * grid.cell_size
+    return positions

@@ -19,11 +19,12 @@ from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid
 from sim.smoke.obstacles import Air, is_solid, part_before
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
-from sim.smoke.source_motion import CELLS, SourceMotion, SweptShape, motion_of
+from sim.smoke.source_motion import CELLS, BodyMotion, SourceMotion, SweptShape, motion_of
 
 BLOCK = 256  # cells whose emission one thread adds up
 FLUCTUATION_CELLS = 4  # edge of the blocks of cells that fluctuate together: smaller ones are averaged away by the flow
 FLUCTUATION_RATE_HZ = 20.0  # how often the fluctuation changes
+BOUNDS_SPACING = 0.5  # of poses around which a box is put, over the reach of a shape
 POSES_PER_CELL = 4.0  # a source that moves emits at poses that are a quarter of a cell apart at most
 
 
@@ -33,6 +34,7 @@ class Noise(NamedTuple):
 
     tick: ti.i32  # number of the present pattern
     salt: ti.i32  # of the seed
+    first: ti.math.ivec3  # lowest cell of the grid, counted in the smoke's box: patterns stay where they are in that
     strength: ti.f32  # how far the heat falls short [-]
 
 
@@ -80,25 +82,38 @@ class Source:
         cell_count: how many cells outside of static solids it covers a part of; if it moves, in the last step.
     """
 
-    def __init__(
-        self, parameters: SmokeSourceParameters, grid: SmokeGrid, air: Air, *, ambient_temperature: float
-    ) -> None:
+    def __init__(self, parameters: SmokeSourceParameters, *, cell_size: float, ambient_temperature: float) -> None:
+        """Prepare it; `enter` puts it into a grid of this cell size [m]."""
         self.parameters = parameters
         self.target_density = parameters.density
         self.target_excess = parameters.temperature - ambient_temperature
-        self._grid, self._air, self._solid = grid, air, grid.pad(grid.solid).ravel()
         self._cells, self._faces = _Places(), [_Places() for _ in range(3)]
         self._emitted = ti.ndarray(ti.f32, 1)
         # Random numbers of other seeds are others; seed 0 leaves the key of a patch as it is.
         self._salt = int(np.uint32(spread(parameters.seed)).view(np.int32))
         self.motion: SourceMotion | None = None
-        self._shape = SweptShape(parameters, grid)
+        self._shape = SweptShape(parameters, cell_size)
         turn, velocity = rotation.from_degrees(parameters.rotation_deg), np.asarray(parameters.velocity or (0.0,) * 3)
         self._own_velocity = rotation.rotated(rotation.conjugate(turn), velocity)
         if parameters.moves:
             self.motion = motion_of(parameters, self._shape.reach)
         else:
-            self._cover([Motion(np.asarray(parameters.position, float), turn, np.zeros(3), np.zeros(3))])
+            self._rest = Motion(np.asarray(parameters.position, float), turn, np.zeros(3), np.zeros(3))
+
+    def enter(self, grid: SmokeGrid) -> None:
+        """Emit into this grid from now on."""
+        self._grid, self._solid = grid, grid.pad(grid.solid).ravel()
+        if self.motion is None:
+            self._cover([self._rest])
+
+    def bounds(self, begin_s: float, end_s: float) -> NDArray[np.float64]:
+        """Corners of a box around where it is from one time to another [s], as far as that is known [m], (2, 3)."""
+        if self.motion is None:
+            return self._shape.bounds(self._rest)
+        spacing = BOUNDS_SPACING * self._shape.reach
+        boxes = np.stack([self._shape.bounds(pose) for pose in self.motion.poses(begin_s, end_s, spacing=spacing)])
+        unseen = (end_s - begin_s) * self.motion.speed() if isinstance(self.motion, BodyMotion) else 0.0
+        return np.stack([boxes[:, 0].min(axis=0) - spacing - unseen, boxes[:, 1].max(axis=0) + spacing + unseen])
 
     @property
     def cell_count(self) -> int:
@@ -114,7 +129,7 @@ class Source:
             return max(map(abs, self.parameters.velocity))
         return math.hypot(*self.parameters.velocity) + self.motion.speed()
 
-    def emit(self, time_s: float, dt: float) -> float:
+    def emit(self, air: Air, time_s: float, dt: float) -> float:
         """Bring the fields to the source's values in a step of dt [s] from a simulated time [s] on.
 
         Fluctuation and flicker are functions of place and time alone, so a run that continues sees the same.
@@ -129,20 +144,19 @@ class Source:
         blocks = -(-max(1, self._cells.count) // BLOCK)
         if self._emitted.shape[0] < blocks:
             self._emitted = ti.ndarray(ti.f32, blocks)
-        noise = Noise(int(time_s * FLUCTUATION_RATE_HZ), self._salt, self.parameters.fluctuation)
+        tick, first = int(time_s * FLUCTUATION_RATE_HZ), ti.math.ivec3(self._grid.first)
+        noise = Noise(tick, self._salt, first, self.parameters.fluctuation)
         targets = ti.math.vec2(strength * self.target_density, strength * self.target_excess)
         is_hot, count = self.target_excess >= 0.0, self._cells.count
         cells = self._cells.indices, self._cells.shares
-        _raise_cells(self._air, *cells, count, noise, targets, is_hot, blocks, self._emitted)
+        _raise_cells(air, *cells, count, noise, targets, is_hot, blocks, self._emitted)
         if self.parameters.velocity is not None:
-            for faces, openness, velocity in zip(
-                self._faces, self._air.openness, self._air.state.velocity, strict=True
-            ):
+            for faces, openness, velocity in zip(self._faces, air.openness, air.state.velocity, strict=True):
                 _set_faces(faces.indices, faces.shares, faces.speeds, openness, velocity, faces.count)
         return float(copied(self._emitted)[:blocks].sum(dtype=np.float64))
 
     def _cover(self, poses: Sequence[Motion]) -> None:
-        swept = self._shape.covered(poses, CELLS)
+        swept = self._shape.covered(self._grid, poses, CELLS)
         is_air = ~self._solid[swept.indices]
         self._cells.put(swept.indices[is_air], swept.shares[is_air])
         if self.parameters.velocity is None:
@@ -151,7 +165,7 @@ class Source:
         spins = np.stack([pose.angular_velocity for pose in poses])
         blown = np.stack([pose.velocity + rotation.rotated(pose.orientation, self._own_velocity) for pose in poses])
         for axis, faces in enumerate(self._faces):
-            swept = self._shape.covered(poses, axis)
+            swept = self._shape.covered(self._grid, poses, axis)
             turning = rotation.cross(spins[swept.poses], swept.places - origins[swept.poses])
             faces.put(swept.indices, swept.shares, (blown[swept.poses] + turning)[:, axis])
 
@@ -192,9 +206,9 @@ def _raise_cells(
 @func
 def _fluctuate(box: Grid, at: ti.i32, noise: Noise):
     """A number in [0, 1) that a few neighbouring cells share."""
-    patch_i = at // box.step_x // FLUCTUATION_CELLS
-    patch_j = at // box.step_y % (box.ny + 2) // FLUCTUATION_CELLS
-    patch_k = at % box.step_y // FLUCTUATION_CELLS
+    patch_i = (noise.first[0] + at // box.step_x) // FLUCTUATION_CELLS
+    patch_j = (noise.first[1] + at // box.step_y % (box.ny + 2)) // FLUCTUATION_CELLS
+    patch_k = (noise.first[2] + at % box.step_y) // FLUCTUATION_CELLS
     patch = (patch_i * 1024 + patch_j) * 1024 + patch_k
     # The odd factor (Knuth's) spreads ticks over all bits, so that they do not shift the pattern.
     key = ti.cast(patch, ti.u32) ^ (ti.cast(noise.tick, ti.u32) * ti.u32(2654435769))
@@ -209,19 +223,21 @@ def _set_faces(faces: Integers, shares: Floats, speeds: Floats, openness: Floats
             velocity[at] = (1.0 - shares[n]) * velocity[at] + shares[n] * speeds[n]
 
 
-def build_sources(parameters: SmokeParameters, grid: SmokeGrid, air: Air) -> Sequence[Source]:
-    """The sources of a smoke.
+def sources_of(parameters: SmokeParameters) -> Sequence[Source]:
+    """The sources of a smoke, in no grid yet."""
+    given = {"cell_size": parameters.cell_size, "ambient_temperature": parameters.ambient_temperature}
+    return [Source(source, **given) for source in parameters.source]
+
+
+def require_cells(parameters: SmokeParameters, sources: Sequence[Source], grid: SmokeGrid) -> None:
+    """Look whether all sources of a smoke can emit in its grid.
 
     Raises:
         ValueError: a source that stays covers no open cell: it lies outside the box or in a solid.
     """
-    sources = [
-        Source(source, grid, air, ambient_temperature=parameters.ambient_temperature) for source in parameters.source
-    ]
     for number, source in enumerate(sources):
         if source.motion is None and source.cell_count == 0:
             raise ValueError(
                 f'smoke "{parameters.name}", source {number}: it covers no cell; move it into the box '
                 f"from {grid.origin} to {grid.upper} m, and out of solids"
             )
-    return sources

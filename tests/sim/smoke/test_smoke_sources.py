@@ -32,9 +32,10 @@ class Emission:
 
     def __init__(self, source: dict) -> None:
         self.grid = SmokeGrid.build(SmokeParameters(name="trail", cell_size=CELL, source=[source]), DOMAIN)
-        air = air_in(self.grid)
-        self.arrays = [*air.state.velocity, air.state.density, air.state.excess]
-        self.source = Source(SmokeSourceParameters(**source), self.grid, air, ambient_temperature=293.0)
+        self.air = air_in(self.grid)
+        self.arrays = [*self.air.state.velocity, self.air.state.density, self.air.state.excess]
+        self.source = Source(SmokeSourceParameters(**source), cell_size=CELL, ambient_temperature=293.0)
+        self.source.enter(self.grid)
         self.emitted = 0.0
 
     def run(self, steps: int, begin_s: float = 0.0, end_s: float = 1.0) -> np.ndarray:
@@ -42,7 +43,7 @@ class Emission:
         dt = (end_s - begin_s) / steps
         for time_s in begin_s + dt * np.arange(steps):
             if self.source.parameters.emits_during(time_s, time_s + dt):
-                self.emitted += self.source.emit(float(time_s), dt)
+                self.emitted += self.source.emit(self.air, float(time_s), dt)
         return self.cells(3)
 
     def clear(self) -> None:
@@ -116,7 +117,7 @@ def test_velocity_of_a_moving_source_is_on_top_of_its_motion_and_turns_with_it()
         {"time_s": 1.0, "position": END, "rotation_deg": (0.0, 0.0, 120.0)},
     ]
     emission = Emission({**MOVING, "keyframe": keyframes, "velocity": (3.0, 0.0, 0.0)})
-    emission.source.emit(0.499999, 1.0e-6)
+    emission.source.emit(emission.air, 0.499999, 1.0e-6)
     middle = np.array([0.5 * (START[0] + END[0]), *START[1:]])
     spin = 0.5 * np.pi
     for axis, expected in ((0, 1.25 + 3.0 * np.cos(0.25 * np.pi)), (1, 3.0 * np.sin(0.25 * np.pi)), (2, 0.0)):

@@ -9,6 +9,7 @@ from sim.smoke.source_motion import CELLS, PARTS, SweptShape, motion_of
 
 DOMAIN = DomainParameters(min=(-0.5, -0.5, 0.0), max=(0.5, 0.5, 1.0))
 CELL = 1.0 / 48.0
+GRID = SmokeGrid.of_cells(DOMAIN.min, CELL, (48, 48, 48), frozenset())
 WAY = [
     {"time_s": 0.0, "position": (-0.3, 0.0, 0.2)},
     {"time_s": 1.0, "position": (0.5, 0.1, 0.4), "rotation_deg": (0.0, 70.0, 160.0)},
@@ -19,8 +20,7 @@ def swept_shape(shape: dict, **changes) -> tuple[SweptShape, list]:
     """A shape that turns on its way out of a box, and poses of a step of a frame and a half."""
     source = {"shape": shape, "keyframe": WAY, **changes}
     smoke = SmokeParameters(name="plume", source=[source], cell_size=CELL)
-    grid = SmokeGrid.build(smoke, DOMAIN)
-    swept = SweptShape(smoke.source[0], grid)
+    swept = SweptShape(smoke.source[0], CELL)
     return swept, motion_of(smoke.source[0], swept.reach).poses(0.5, 0.55, spacing=CELL / 4.0)
 
 
@@ -38,8 +38,8 @@ def test_a_step_covers_what_its_poses_do_and_the_last_of_them_counts(shape, chan
     swept, poses = swept_shape(shape, **changes)
     expected: dict[int, int] = {}
     for number, pose in enumerate(poses):
-        expected |= dict.fromkeys(swept.covered([pose], axis).indices.tolist(), number)
-    found = swept.covered(poses, axis)
+        expected |= dict.fromkeys(swept.covered(GRID, [pose], axis).indices.tolist(), number)
+    found = swept.covered(GRID, poses, axis)
     assert len(poses) > 5
     assert len(found.indices) > 50
     assert dict(zip(found.indices.tolist(), found.poses.tolist(), strict=True)) == expected
@@ -55,10 +55,10 @@ def test_a_place_is_looked_at_again_only_where_it_may_have_been_covered():
         return distance(points)
 
     swept._distance = counted
-    swept.covered(poses[-1:], CELLS)
+    swept.covered(GRID, poses[-1:], CELLS)
     in_box = asked[0]
     asked.clear()
-    swept.covered(poses, CELLS)
+    swept.covered(GRID, poses, CELLS)
     # For one pose all cells of its box, and all points of those near its surface; for each of the others layers of both
     # that are a quarter of a cell thick, in front and at corners that the turning might have reached.
     assert sum(asked) < 0.16 * len(poses) * in_box * (1 + PARTS**3)
