@@ -155,6 +155,12 @@ class Source:
                 _set_faces(faces.indices, faces.shares, faces.speeds, openness, velocity, faces.count)
         return float(copied(self._emitted)[:blocks].sum(dtype=np.float64))
 
+    def add_fuel(self, air: Air, fuel: ti.Ndarray, time_s: float, dt: float) -> None:
+        """Bring the fuel of the gas to the source's, in the cells of the `emit` before with the same step."""
+        begin_s, end_s = self.parameters.span_of(time_s, time_s + dt)
+        target = self.parameters.largest_strength(begin_s, end_s) * self._steadiness(end_s) * self.parameters.fuel
+        _raise_fuel(air, self._cells.indices, self._cells.shares, self._cells.count, target, fuel)
+
     def _cover(self, poses: Sequence[Motion]) -> None:
         swept = self._shape.covered(self._grid, poses, CELLS)
         is_air = ~self._solid[swept.indices]
@@ -201,6 +207,13 @@ def _raise_cells(
                 target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * shares[n] * targets[1]
                 excess[at] = ti.max(excess[at], target) if ti.static(is_hot) else ti.min(excess[at], target)
         added[block] = emitted
+
+
+@kernel
+def _raise_fuel(air: Air, cells: Integers, shares: Floats, count: ti.i32, target: ti.f32, fuel: Floats):
+    for n in range(count):
+        if not is_solid(air.solids, cells[n]):
+            fuel[cells[n]] = ti.max(fuel[cells[n]], shares[n] * target)
 
 
 @func
