@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import NodeSums, PushedNodes, Response
-from sim.cloth.contact_response import NOT_AHEAD, OF_MORE_STEPS, OF_TURN, STEPS, push, weigh_contacts
+from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
@@ -23,8 +23,8 @@ from sim.core.bundles import with_room
 from sim.core.host_access import copied, take
 from sim.core.reductions import LaneReduction, runs_on_gpu
 
-MORE_ITERATIONS = 2 * STEPS
-"""Steps of the contact iteration that follow the first `STEPS` where those are not enough, as
+MORE_ITERATIONS = 16
+"""Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
 in stacks and impacts; two layers under their weight need one step."""
 
 REPAIRS = 4  # rounds in which crossing pairs are pushed before they become impact zones
@@ -89,7 +89,7 @@ class ContinuousContacts:
         self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
-        self._is_warm = self._expects = self._foresees_more = False
+        self._is_warm = self._expects = False
         self._conclude: Callable[[ti.Ndarray], None] | None = None
         self.begin_frame()
 
@@ -246,12 +246,10 @@ class ContinuousContacts:
             if is_ahead:
                 pushed = self._begin_push(state, is_first=True)
                 turns.ask()
-                for turn in range(turns.foreseen):
+                for _ in range(turns.foreseen):
                     turns.take(is_ahead=True)
-                    pushed = self._push_on(state, 0, settles=True, finishes=True, ahead=OF_TURN)
-                    turns.ask(ahead=turn + 1)
-                if self._foresees_more and turns.decides:
-                    pushed = self._push_more(state, is_ahead=True)
+                    pushed = self._push_on(state, 0, settles=True, finishes=True, is_ahead=True)
+                    turns.ask()
                 begun = pushed, self._finish(state, self._contacts.capacity, is_changed=True, is_ahead=True)
                 if not self._has_bounds():
                     return -1, None
@@ -277,7 +275,7 @@ class ContinuousContacts:
             turns.ask()
         while True:
             found = pushed()
-            pushing, _, is_missing, settled, had_more = found
+            pushing, _, is_missing, settled = found
             if not turns.go_on(pushes=bool(pushing or settled)):
                 break
             is_ahead = False
@@ -285,24 +283,17 @@ class ContinuousContacts:
             pushed = self._push_on(state, 0, settles=True, finishes=True)
             turns.ask()
         self._iterations += (turns.taken - before) * (STEPS if pushing else settled)
-        self._foresees_more = self._push_further(state, found)
-        return is_ahead and turns.decides and bool(had_more or not (pushing and is_missing))
+        self._push_further(state, found)
+        return is_ahead and turns.decides and not (pushing and is_missing)
 
-    def _push_further(self, state: ClothState, found: Sequence[int]) -> bool:
-        """More steps, where the round that `found` what `push` returns was not enough; returns whether it was not."""
-        pushing, _, is_missing, settled, had_more = found
+    def _push_further(self, state: ClothState, found: Sequence[int]) -> None:
+        """More steps, where the round that `found` what `push` returns was not enough."""
+        pushing, _, is_missing, settled = found
         self._iterations += STEPS if pushing else settled
-        if pushing and is_missing and not had_more:
-            self._push_more(state)
-            had_more = True
-        self._iterations += MORE_ITERATIONS if had_more else 0
-        return bool(had_more)
-
-    def _push_more(self, state: ClothState, *, is_ahead: bool = False) -> Callable[[], list[int]]:
-        """More steps; asks for what `push` returns."""
-        ahead = OF_MORE_STEPS if is_ahead else NOT_AHEAD
-        self._push_on(state, 0, settles=False, finishes=False, ahead=ahead)
-        return self._push_on(state, STEPS, settles=False, finishes=True, ahead=ahead)
+        if pushing and is_missing:
+            for step in range(0, MORE_ITERATIONS, STEPS):
+                self._push_on(state, step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
+            self._iterations += MORE_ITERATIONS
 
     def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
         """A round of the first `STEPS` steps; asks for what `push` returns."""
@@ -310,11 +301,11 @@ class ContinuousContacts:
         return self._push_on(state, 0, settles=True, finishes=True)
 
     def _push_on(
-        self, state: ClothState, first: int, *, settles: bool, finishes: bool, ahead: int = NOT_AHEAD
+        self, state: ClothState, first: int, *, settles: bool, finishes: bool, is_ahead: bool = False
     ) -> Callable[[], list[int]]:
         """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
-        flags = (int(flag) for flag in (first == 0, settles, finishes))
-        return push.later(_momenta_from(first), *flags, ahead, self._response, state.thickness)
+        flags = (int(flag) for flag in (first == 0, settles, finishes, is_ahead))
+        return push.later(_momenta_from(first), *flags, self._response, state.thickness)
 
     @property
     def _response(self) -> Response:
@@ -373,8 +364,8 @@ class Turns:
 
     taken, foreseen, decides = 0, 0, False
 
-    def ask(self, *, ahead: int = 0) -> None:
-        """Have it found out whether springs have to take another turn; so many are `ahead` of those known as taken."""
+    def ask(self) -> None:
+        """Have it found out whether springs have to take another turn."""
 
     def take(self, *, is_ahead: bool = False) -> None:
         """Let springs change displacements; if it `is_ahead` of what is known, only where they have to."""

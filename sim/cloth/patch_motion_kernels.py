@@ -23,7 +23,6 @@ from sim.cloth.bundles import (
 from sim.cloth.contact_response import thickness_between
 from sim.cloth.near_pairs import NEVER, SAFETY_OF_DUE
 from sim.cloth.proximity_contacts import EDGE_EDGE
-from sim.cloth.state import OVER, OVER_WITH_MORE
 from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
@@ -539,8 +538,7 @@ def end_contacts(
     that they lack, or of contacts that have no room.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    is_enough = end.rounds[0] == OVER and (end.counter[0] == 0 or end.counter[3] == 0)
-    is_over = (is_enough or end.rounds[0] == OVER_WITH_MORE) and contacts.counter[3] > 0
+    is_over = end.rounds[0] == 0 and (end.counter[0] == 0 or end.counter[3] == 0) and contacts.counter[3] > 0
     ends = ti.cast(end.is_ahead == 0 or is_over, ti.i32)
     contacts_end, vertices_end = ends * ti.min(count, contacts.counter[3]), ends * vertex_count
     displaced_end, patches_end, pairs_end = ends * workers[0], ends * workers[1], ends * workers[2]

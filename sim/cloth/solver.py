@@ -69,7 +69,7 @@ class SpringTurns(Turns):
         self._integrator, self._dt, self._cloths = integrator, dt, cloths
         self._asked: Callable[[], NDArray[np.float64]] | None = None
         self.decides = integrator.foresees(cloths)
-        self._foreseen, self.taken = foreseen, 0
+        self._foreseen, self.taken, self._next = foreseen, 0, 0
 
     @property
     def foreseen(self) -> int:
@@ -91,18 +91,19 @@ class SpringTurns(Turns):
         """Ask how long springs are, which decides nothing."""
         self._asked = functools.cache(self._integrator.excess(self._dt))
 
-    def ask(self, *, ahead: int = 0) -> None:  # noqa: D102  (as `Turns` says, here and below)
-        turn = self.taken + ahead if self.decides else NO_TURN
+    def ask(self) -> None:  # noqa: D102  (as `Turns` says, here and below)
+        turn = self._next if self.decides else NO_TURN
         self._asked = functools.cache(self._integrator.excess(self._dt, turn))
 
     def take(self, *, is_ahead: bool = False) -> None:  # noqa: D102
+        self._next += 1
         self.taken += int(not is_ahead)
         self._integrator.sweep(self._dt, self._cloths, is_ahead=is_ahead)
 
     def go_on(self, *, pushes: bool) -> bool:  # noqa: D102
         excess = self.excess[self._cloths].max(initial=0.0)
         if self.decides:
-            self.taken = self._integrator.turns_taken
+            self.taken = self._next = self._integrator.turns_taken
         return pushes and self.taken < MOST_TURNS and excess > RELAXED_BEYOND
 
 

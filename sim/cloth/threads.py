@@ -8,7 +8,7 @@ import taichi as ti
 from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
 from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
 from sim.cloth.parameters import MOST_TURNS
-from sim.cloth.state import GO_ON, OVER, ClothState
+from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func, with_room
 from sim.core.launch import kernel, large_kernel
@@ -273,8 +273,7 @@ def solve_threads(
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
     Nothing is done if it `is_ahead` of `rounds` that do not go on.
     """
-    goes_on = ti.cast(is_ahead == 0 or rounds[0] == GO_ON, ti.i32)
-    threads = goes_on * ti.static(rows if runs_on_gpu() else 1)
+    threads = ti.select(is_ahead == 1, rounds[0], 1) * ti.static(rows if runs_on_gpu() else 1)
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
@@ -446,7 +445,7 @@ def measure_excess(
     Before a `turn`, a number from 0 on, `rounds` go on if contacts push and the excess is above a limit, up to the
     `most_turns`; if they did not before, what was found stays. Returns also how many turns have been taken.
     """
-    is_asked = turn == NO_TURN or rounds[0] == GO_ON
+    is_asked = turn == NO_TURN or rounds[0] == 1
     end = ti.select(is_asked, count, 0)
     whole_end = whole_warps(end)
     if is_asked:
@@ -465,7 +464,6 @@ def measure_excess(
         if excess > LARGEST_RESIDUAL:
             ti.atomic_add(found[1], 1)
     largest = ti.bit_cast(found[0], ti.f32)
-    if turn != NO_TURN and rounds[0] == GO_ON:
-        rounds[0] = ti.select(largest > limit and turn < most_turns and rounds[2] > 0, GO_ON, OVER)
-        rounds[1] = turn
+    if turn != NO_TURN and rounds[0] == 1:
+        rounds[0], rounds[1] = ti.cast(largest > limit and turn < most_turns and rounds[2] > 0, ti.i32), turn
     return ti.math.vec3(largest, ti.cast(found[1], ti.f32), ti.cast(rounds[1], ti.f32))
