@@ -272,11 +272,8 @@ class MovingPatches(NamedTuple):
 
 @bundle
 class SubstepEnd(NamedTuple):
-    """Limits by which patches finish a substep, and what contacts say of its end."""
+    """Limits by which patches finish a substep."""
 
-    is_ahead: ti.i32  # whether it only ends if rounds do, with all contacts as they should be
-    counter: Integers  # see `NodeSums`
-    rounds: Integers  # see `ClothState`
     is_changed: ti.i32  # whether contacts displaced anything
     astray: ti.f32  # largest distance of a vertex from where it was expected [m]
     still: ti.f32  # differences of displacements that are not fitted [m]
@@ -462,7 +459,6 @@ class NodeSums(NamedTuple):
     """Numbers of each node that are found as contacts are weighed."""
 
     counter: Integers  # contacts that push, their nodes, and uses; whether any misses much, is settled, (5,)
-    rounds: Integers  # see `ClothState`
     predicted: Vectors  # displacement as contacts were looked for [m], (n,)
     shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
     held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)

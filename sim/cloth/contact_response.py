@@ -225,8 +225,6 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
-    if is_first == 1:
-        sums.rounds[0] = 1
     for i in range(all_end):
         if i < vertex_count:
             sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
@@ -494,33 +492,23 @@ TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they
 
 @large_kernel
 def push(
-    momenta: Momenta,
-    starts: ti.i32,
-    settles: ti.i32,
-    finishes: ti.i32,
-    is_ahead: ti.i32,
-    r: Response,
-    thickness: Floats,
+    momenta: Momenta, starts: ti.i32, settles: ti.i32, finishes: ti.i32, r: Response, thickness: Floats
 ) -> ti.math.ivec4:
     """Some steps of the iteration of a round of contacts that were weighed (`weigh_contacts`), and where they lead if
-    it `finishes`; first those that one step solves, if it `settles` them. Nothing is done if it `is_ahead` of rounds
-    that do not go on.
+    it `finishes`; first those that one step solves, if it `settles` them.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
     `TOLERANCE` then, and whether any are settled.
     """
     contacts, sums = ti.static((r.contacts, r.sums))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    goes_on = ti.select(is_ahead == 1, sums.rounds[0], 1)
-    pushing_count, touched_count = goes_on * sums.counter[0], goes_on * sums.counter[1]
-    moved_end = touched_count + goes_on * r.bodies.count
+    pushing_count, touched_count = sums.counter[0], sums.counter[1]
+    moved_end = touched_count + r.bodies.count
     new_end = starts * ti.max(pushing_count, moved_end)
     finished_end, finished_moved_end = finishes * pushing_count, finishes * moved_end
-    settled_end = goes_on * settles * sums.counter[4] * contacts.counter[3]
+    settled_end = settles * sums.counter[4] * contacts.counter[3]
     whole_end = whole_warps(settled_end)
-    sums.rounds[2] = sums.counter[0] + sums.counter[4]
-    if goes_on == 1:
-        sums.counter[3] = 0
+    sums.counter[3] = 0
     settle_all(settled_end, whole_end, r)
     push_apart(momenta, new_end, pushing_count, touched_count, moved_end, r)
     finish_push(finished_end, touched_count, finished_moved_end, r)
@@ -530,4 +518,4 @@ def push(
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
             sums.counter[3] = 1
-    return ti.math.ivec4(sums.counter[0], sums.counter[1], sums.counter[3], sums.counter[4])
+    return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])

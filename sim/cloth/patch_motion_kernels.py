@@ -522,8 +522,8 @@ def end_contacts(
     workers: ti.math.ivec3,
     counters: Counters,
 ) -> ti.math.ivec3:
-    """Test `count` contacts at most (`repair_crossing`); if none failed, measure how far they displaced patches; if not
-    farther than allowed for, displacements are final: note where they lead, and what of the lists they use up.
+    """Test `count` contacts (`repair_crossing`); if none failed, measure how far they displaced patches; if not farther
+    than allowed for, displacements are final: note where they lead, and what of the lists they use up.
 
     Args:
         count, contacts, tested: see `repair_crossing`.
@@ -534,15 +534,12 @@ def end_contacts(
         counters: three numbers.
 
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
-    is not finite. Nothing is done, and farther is said, if the end `is_ahead` of rounds that are not over, of steps
-    that they lack, or of contacts that have no room.
+    is not finite.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    is_over = end.rounds[0] == 0 and (end.counter[0] == 0 or end.counter[3] == 0) and contacts.counter[3] > 0
-    ends = ti.cast(end.is_ahead == 0 or is_over, ti.i32)
-    contacts_end, vertices_end = ends * ti.min(count, contacts.counter[3]), ends * vertex_count
-    displaced_end, patches_end, pairs_end = ends * workers[0], ends * workers[1], ends * workers[2]
-    counters.found[0], counters.found[1], counters.found[2] = 0, 1 - ends, 0
+    contacts_end, vertices_end = count, vertex_count
+    displaced_end, patches_end, pairs_end = workers[0], workers[1], workers[2]
+    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
     for c in range(contacts_end):
         repair_crossing(c, contacts, tested, nodes, counters.found)
     begin_sharing(counters.taken, 0)

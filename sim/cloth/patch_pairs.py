@@ -154,8 +154,7 @@ class PatchPairs:
         bounds: boxes around patches at the last `look`, and the rigid motion of each in the substep.
         budget: how far they move, and may be displaced by contacts.
         carried: numbers that pairs had before the last `meet`, or -1, (count,).
-        counters: of `look_at_patches`.
-        outcome: what the last `finish` answers, on the device.
+        counters: of `look_at_patches` and `end_contacts`.
         expired_count, due_count: how many pairs have to be searched, and have elements that have to be looked at.
 
     Args:
@@ -172,7 +171,6 @@ class PatchPairs:
         self._tree: BoxTree = with_room(BoxTree, 2 * patches.leaves, leaves=patches.leaves)
         self._moving = MovingPatches(patches.corner_lists, self.bounds, self.budget)
         self.counters: Counters = with_room(Counters, 3)
-        self.outcome = ti.ndarray(ti.i32, 3)
         self._first_known = ti.ndarray(ti.i32, 2 * max(m, 1))
         self._maxima = LaneReduction(maxima=7, sums=0)
         self._astray, self._half_thickness, self._still, self._fits = 0.0, 0.0, 0.0, True
@@ -317,7 +315,6 @@ class PatchPairs:
         contacts: ContactList,
         count: int,
         negligible: float,
-        rounds: tuple[int, ti.Ndarray, ti.Ndarray],
         *,
         is_changed: bool,
     ) -> Callable[[], list[int]]:
@@ -330,9 +327,8 @@ class PatchPairs:
             state: at the end of its displacements.
             predicted: displacements as contacts were looked for.
             contacts: in the substep.
-            count: of those that are tested, at most.
+            count: of those that are tested.
             negligible: what contacts may add without the motion of patches being looked at anew [m].
-            rounds: the first three of `SubstepEnd`.
             is_changed: whether contacts changed displacements.
         """
         patches, half = self.patches, self._half_thickness
@@ -344,8 +340,8 @@ class PatchPairs:
             self._tracked(state),
             predicted,
             self._moving,
-            SubstepEnd(*rounds, int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
+            SubstepEnd(int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
             self.on_device,
             (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
-            Counters(self.counters.taken, self.outcome),
+            self.counters,
         )

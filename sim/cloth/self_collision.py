@@ -138,22 +138,15 @@ class SelfCollision:
         self.with_triangles.resize(self.with_triangles.capacity)
 
     def finish(
-        self,
-        state: ClothState,
-        predicted: ti.Ndarray,
-        contacts: ContactList,
-        count: int,
-        rounds: tuple[int, ti.Ndarray, ti.Ndarray],
-        *,
-        is_changed: bool,
+        self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
     ) -> Callable[[], list[int]]:
         """See `PatchPairs.finish`."""
         if not (self.meets or is_changed or self._was_changed):
             self.outcome = self._nothing
             return lambda: [0, 0, 0]
-        self.outcome = self.patch_pairs.outcome
+        self.outcome = self.patch_pairs.counters.found
         self._was_changed, negligible = is_changed, NEGLIGIBLE * self.thickness
-        return self.patch_pairs.finish(state, predicted, contacts, count, negligible, rounds, is_changed=is_changed)
+        return self.patch_pairs.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.

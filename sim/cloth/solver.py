@@ -1,6 +1,5 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
-import functools
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir, push_nodes
 from sim.cloth.cells import cells_of
-from sim.cloth.continuous_contacts import ContinuousContacts, Turns
+from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.device_cells import DeviceCells
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
@@ -28,7 +27,6 @@ from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths, Load, finish_step
-from sim.cloth.threads import NO_TURN, RELAXED_BEYOND
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
@@ -42,69 +40,15 @@ SOLVER_NAME = "cloth"
 
 INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 
-REFINED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.02, 0.035
-"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; below
-which sweeps go back, and below which steps do: turns end (`RELAXED_BEYOND`) between both. It falls with every turn and
-sweep, and with the square of the step."""
+REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.03, 0.02, 0.035
+"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; beyond
+which springs and contacts take another turn; below which sweeps go back, and below which steps do: turns end between
+both. It falls with every turn and sweep, and with the square of the step."""
 
 FIXED_KEYS = frozenset(
     ("name", "shape", "position", "rotation_deg", "velocity", "material", "pin", "integrator", "substeps", "iterations")
 )
 """What cannot change between frames; all else can."""
-
-
-class SpringTurns(Turns):
-    """Turns of springs in a substep of dt [s].
-
-    Args:
-        integrator: of the springs.
-        dt: [s].
-        cloths: which take turns, (b,) bool.
-        foreseen: turns in the substep before.
-    """
-
-    def __init__(
-        self, integrator: XPBDSprings | ExplicitSprings, dt: float, cloths: NDArray[np.bool_], foreseen: int
-    ) -> None:
-        self._integrator, self._dt, self._cloths = integrator, dt, cloths
-        self._asked: Callable[[], NDArray[np.float64]] | None = None
-        self.decides = integrator.foresees(cloths)
-        self._foreseen, self.taken, self._next = foreseen, 0, 0
-
-    @property
-    def foreseen(self) -> int:
-        """As many as in the substep before, where the device decides."""
-        return min(self._foreseen, MOST_TURNS - self.taken) if self.decides else 0
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether it was asked how long springs are."""
-        return self._asked is not None
-
-    @property
-    def excess(self) -> NDArray[np.float64]:
-        """What was measured last [rest lengths], (b,)."""
-        assert self._asked is not None
-        return self._asked()
-
-    def measure(self) -> None:
-        """Ask how long springs are, which decides nothing."""
-        self._asked = functools.cache(self._integrator.excess(self._dt))
-
-    def ask(self) -> None:  # noqa: D102  (as `Turns` says, here and below)
-        turn = self._next if self.decides else NO_TURN
-        self._asked = functools.cache(self._integrator.excess(self._dt, turn))
-
-    def take(self, *, is_ahead: bool = False) -> None:  # noqa: D102
-        self._next += 1
-        self.taken += int(not is_ahead)
-        self._integrator.sweep(self._dt, self._cloths, is_ahead=is_ahead)
-
-    def go_on(self, *, pushes: bool) -> bool:  # noqa: D102
-        excess = self.excess[self._cloths].max(initial=0.0)
-        if self.decides:
-            self.taken = self._next = self._integrator.turns_taken
-        return pushes and self.taken < MOST_TURNS and excess > RELAXED_BEYOND
 
 
 class ClothSolver:
@@ -181,7 +125,7 @@ class ClothSolver:
         self._no_reasons = ti.ndarray(ti.i32, 3)
         self._no_reasons.fill(0)
         self._sweeps = self._refinement = 1
-        self._excess, self._turns_before = 0.0, 0
+        self._excess = 0.0
         self._hold_pins()
 
     def change(self, name: str, **changes: object) -> None:
@@ -305,28 +249,44 @@ class ClothSolver:
         for. Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
         shortened for those that omit `substeps`.
         """
-        state, integrator = self.state, self._integrator
+        state, integrator, turns = self.state, self._integrator, 0
+        at_end: Callable[[], NDArray[np.float64]] | None = None
         integrator.displace(dt, np.where(self._adapts, self._sweeps, self._iterations))
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        turns = SpringTurns(integrator, dt, self._takes_turns, self._turns_before)
-        if self._adapts.any() and is_loose:
-            turns.measure()
-        by_springs = float(turns.excess[self._adapts].max()) if turns.is_measured else 0.0
+        excess = integrator.excess(dt)() if self._adapts.any() and is_loose else None
+        by_springs = 0.0 if excess is None else float(excess[self._adapts].max())
+
+        def relax() -> Callable[[], bool]:
+            measured = integrator.excess(dt)
+
+            def go_on() -> bool:
+                nonlocal turns, excess
+                excess = measured()
+                if turns == MOST_TURNS or excess[self._takes_turns].max(initial=0.0) < RELAXED_BEYOND:
+                    return False
+                turns += 1
+                integrator.sweep(dt, self._takes_turns)
+                return True
+
+            return go_on
 
         def conclude(reasons: ti.Ndarray) -> None:
-            if not turns.is_measured:
-                turns.measure()
+            nonlocal at_end
+            if excess is None:
+                at_end = integrator.excess(dt)
             finish_step(state.nodes, state.position, state.limit, dt, reasons)
 
-        if self.contacts is None or not self.contacts.resolve(state, dt, turns, conclude):
+        if self.contacts is None or not self.contacts.resolve(state, dt, relax, conclude):
             conclude(self._no_reasons)
-        excess, self._turns_before = turns.excess, turns.taken
+        if excess is None:
+            assert at_end is not None
+            excess = at_end()
         self._excess = float(excess[self._refines].max(initial=0.0))
         if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
             self._refinement = min(2 * self._refinement, MOST_REFINED)
-        elif self._excess < LENGTHENED_BELOW and turns.taken < 2:
+        elif self._excess < LENGTHENED_BELOW and turns < 2:
             self._refinement = max(self._refinement // 2, 1)
         if by_springs < RESTORED_BELOW:
             self._sweeps = max(self._sweeps // 2, 1)

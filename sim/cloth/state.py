@@ -105,8 +105,6 @@ class ClothState:
         eyelets: what nodes weigh besides their share of the sheet [kg], (n,).
         quantum: unit of the lattice [m].
         limit: end of the lattice on each axis, in quanta; nodes that come there are stopped.
-        rounds: of contacts in a substep, on the device: whether springs take another turn, how many they have taken,
-            and how many contacts push, (3,).
     """
 
     def __init__(self, host: HostCloths, *, reach: float) -> None:
@@ -120,8 +118,6 @@ class ClothState:
         self.host = host
         self.quantum = quantum_of(reach)
         self.limit = int(reach / self.quantum)
-        self.rounds = ti.ndarray(ti.i32, 3)
-        self.rounds.fill(0)
         self.nodes: Nodes = with_room(Nodes, n, quantum=self.quantum)
         self.surface: Surface = with_room(Surface, n, displacement=self.nodes.displacement)
         self.lattice, _, self.inverse_mass, self.displacement, self.carry, self.velocity = self.nodes

@@ -7,7 +7,6 @@ import taichi as ti
 
 from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
 from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
-from sim.cloth.parameters import MOST_TURNS
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func, with_room
@@ -27,11 +26,6 @@ STRAIGHTENED = 0.35
 
 LEAST_WEIGHT = 1.0e-20  # inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions
 LEAST_ALIKE = 0.995  # cosine of the angle that a spring may turn by in a step for its direction to be that of the start
-
-RELAXED_BEYOND = float(np.float32(0.03))
-"""Excess of a spring [rest lengths] beyond which springs and contacts take another turn."""
-
-NO_TURN = -1
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -70,16 +64,12 @@ class ThreadSolver:
         while self._rows < np.diff(starts).max(initial=0) + 1:
             self._rows *= 2
 
-    def displace(self, state: ClothState, dt: float, *, is_first: bool, is_ahead: bool = False) -> None:
-        """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0.
-
-        If `is_ahead`, only where `ClothState.rounds` go on, of which the host does not know yet.
-        """
+    def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
+        """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
         springs, nodes, step = self.springs, state.nodes, self.springs.first_colours.step
         springs.contract(nodes, state.displacement)
         for colour in springs.first_colours:
-            ahead = state.rounds, int(is_ahead)
-            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, *ahead, self._rows, step)
+            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, self._rows, step)
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for fixed directions.
@@ -92,15 +82,13 @@ class ThreadSolver:
         for colour in springs.first_colours:
             straighten_threads(springs.on_device, colour, state.nodes, dt, self._work, self._rows, step)
 
-    def excess(self, state: ClothState, dt: float, turn: int = NO_TURN) -> Callable[[], tuple[float, float, float]]:
-        """Asks for the largest excess of a spring [rest lengths], and how many have not converged (`excess_of`); and
-        how many turns springs had taken then.
-
-        If a `turn` is numbered, that decides whether `ClothState.rounds` go on; where they do not, nothing is measured.
+    def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
+        """Asks for the largest excess of a spring [rest lengths], and how many have not converged
+        (`excess_of`).
         """
-        springs, rounds = self.springs, (state.rounds, turn, MOST_TURNS, RELAXED_BEYOND)
+        springs = self.springs
         return measure_excess.later(
-            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found, *rounds
+            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found
         )
 
 
@@ -260,8 +248,6 @@ def solve_threads(
     dt: ti.f32,
     is_first: ti.i32,
     work: ThreadWork,
-    rounds: Integers,
-    is_ahead: ti.i32,
     rows: ti.template(),
     colours: ti.template(),
 ):
@@ -271,9 +257,8 @@ def solve_threads(
 
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
-    Nothing is done if it `is_ahead` of `rounds` that do not go on.
     """
-    threads = ti.select(is_ahead == 1, rounds[0], 1) * ti.static(rows if runs_on_gpu() else 1)
+    threads = ti.static(rows if runs_on_gpu() else 1)
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
@@ -429,27 +414,11 @@ def excess_of(
 
 @kernel
 def measure_excess(
-    springs: SpringArrays,
-    count: ti.i32,
-    multiplier: Floats,
-    nodes: Nodes,
-    dt_squared: ti.f32,
-    found: Integers,
-    rounds: Integers,
-    turn: ti.i32,
-    most_turns: ti.i32,
-    limit: ti.f32,
-) -> ti.math.vec3:
-    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`.
-
-    Before a `turn`, a number from 0 on, `rounds` go on if contacts push and the excess is above a limit, up to the
-    `most_turns`; if they did not before, what was found stays. Returns also how many turns have been taken.
-    """
-    is_asked = turn == NO_TURN or rounds[0] == 1
-    end = ti.select(is_asked, count, 0)
-    whole_end = whole_warps(end)
-    if is_asked:
-        found[0], found[1] = 0, 0
+    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
+) -> ti.math.vec2:
+    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
+    end, whole_end = count, whole_warps(count)
+    found[0], found[1] = 0, 0
     for s in range(whole_end):
         excess = 0.0
         if s < end:
@@ -463,7 +432,4 @@ def measure_excess(
             ti.atomic_max(found[0], largest)
         if excess > LARGEST_RESIDUAL:
             ti.atomic_add(found[1], 1)
-    largest = ti.bit_cast(found[0], ti.f32)
-    if turn != NO_TURN and rounds[0] == 1:
-        rounds[0], rounds[1] = ti.cast(largest > limit and turn < most_turns and rounds[2] > 0, ti.i32), turn
-    return ti.math.vec3(largest, ti.cast(found[1], ti.f32), ti.cast(rounds[1], ti.f32))
+    return ti.math.vec2(ti.bit_cast(found[0], ti.f32), ti.cast(found[1], ti.f32))
