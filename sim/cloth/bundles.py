@@ -276,8 +276,6 @@ class SubstepEnd(NamedTuple):
 
     is_changed: ti.i32  # whether contacts displaced anything
     astray: ti.f32  # largest distance of a vertex from where it was expected [m]
-    still: ti.f32  # differences of displacements that are not fitted [m]
-    negligible: ti.f32  # displacement by contacts after which a patch is not fitted anew [m]
     least_margin: ti.f32  # [m]
     half_thickness: ti.f32  # [m]
 

@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -170,7 +171,7 @@ class ContinuousContacts:
         self,
         state: ClothState,
         dt: float,
-        relax: Callable[[], Callable[[], bool]],
+        turns: Turns | None = None,
         conclude: Callable[[ti.Ndarray], None] | None = None,
     ) -> bool:
         """Change the displacements of a substep of dt [s], after the springs have, so that nothing crosses; pinned
@@ -179,8 +180,7 @@ class ContinuousContacts:
         Args:
             state: with displacements.
             dt: [s].
-            relax: asks how long springs are. The answer lets them change displacements once more where contacts
-                stretched them too much, and says whether it did; contacts are resolved again then.
+            turns: that springs take, where contacts stretched them too much; contacts are resolved again then.
             conclude: has the device finish the step if three numbers there are 0, as they are where nothing remains to
                 be done: a GPU would wait while the host reads them.
         """
@@ -193,13 +193,13 @@ class ContinuousContacts:
             self._warm_up(state)
             self._is_warm = True
         while True:
-            found, begun = self._find(state, dt, relax)
+            found, pushed = self._find(state, dt, turns)
             if found < 0:
                 self._contacts.forget()
                 self._velocities = None
                 return False  # the solver says which quantity is not finite, or ran away
             if found:
-                self._push_in_turns(state, relax, begun)
+                self._push_in_turns(state, turns, pushed)
             left, is_beyond, not_finite = self._keep_apart(state, found)
             if not_finite:
                 self._velocities = None
@@ -221,14 +221,12 @@ class ContinuousContacts:
         if self._pairs.meets:
             self._pairs.warm_up()
 
-    def _find(
-        self, state: ClothState, dt: float, relax: Callable[[], Callable[[], bool]]
-    ) -> tuple[int, tuple[Callable[[], list[int]], Callable[[], bool]] | None]:
+    def _find(self, state: ClothState, dt: float, turns: Turns | None) -> tuple[int, Callable[[], list[int]] | None]:
         """Number of contacts, or -1 where cloth has no bounds; and a first round of pushes, where that has begun.
 
         It has on a GPU, where there were contacts in the last substep: so the device need not wait for the host.
         """
-        recovery, begun = min(1.0, dt / RECOVERY_TIME_S), None
+        recovery, pushed = min(1.0, dt / RECOVERY_TIME_S), None
         is_ahead = self._expects and runs_on_gpu()
         while True:
             if not is_ahead and not self._has_bounds():
@@ -239,7 +237,7 @@ class ContinuousContacts:
                 state, self._patches, met.bounds.motion, met.budget.margin, self._contacts, recovery
             )
             if is_ahead:
-                begun = self._begin_push(state, is_first=True), relax()
+                pushed = self._push_and_measure(state, turns)
                 if not self._has_bounds():
                     return -1, None
                 if not self._pairs.looked()[1]:
@@ -247,28 +245,24 @@ class ContinuousContacts:
             found, *ends = asked()
             had_no_room = self._pairs.make_room_for(ends)
             if not self._contacts.make_room_for(found) and not had_no_room:
-                return found, begun
+                return found, pushed
 
     def _has_bounds(self) -> bool:
         """Whether what was looked at moves within reason."""
         motion, _ = self._pairs.looked()
         return math.isfinite(motion) and motion <= 1.0e6
 
-    def _push_in_turns(
-        self,
-        state: ClothState,
-        relax: Callable[[], Callable[[], bool]],
-        begun: tuple[Callable[[], list[int]], Callable[[], bool]] | None,
-    ) -> None:
-        """Push in turns with the springs, for as long as these `relax`; the first round may have begun."""
+    def _push_in_turns(self, state: ClothState, turns: Turns | None, pushed: Callable[[], list[int]] | None) -> None:
+        """Push in turns with the springs, for as long as these need them; the first round may have `pushed` already."""
+        if pushed is None:
+            pushed = self._push_and_measure(state, turns)
         while True:
-            pushed, go_on = begun or (self._begin_push(state, is_first=True), relax())
             found = pushed()
             pushing, _, _, settled = found
-            if not (pushing or settled) or not go_on():
+            if turns is None or not (pushing or settled) or not turns.relax():
                 break
             self._iterations += STEPS if pushing else settled
-            begun = self._push_on(state, 0, settles=True, finishes=True), relax()
+            pushed = self._push_and_measure(state, turns, is_first=False)
         self._push_further(state, found)
 
     def _push_further(self, state: ClothState, found: Sequence[int]) -> None:
@@ -279,6 +273,18 @@ class ContinuousContacts:
             for step in range(0, MORE_ITERATIONS, STEPS):
                 self._push_on(state, step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
             self._iterations += MORE_ITERATIONS
+
+    def _push_and_measure(
+        self, state: ClothState, turns: Turns | None, *, is_first: bool = True
+    ) -> Callable[[], list[int]]:
+        """A round of steps, and how long springs are after it; asks for what `push` returns."""
+        if is_first:
+            pushed = self._begin_push(state, is_first=True)
+        else:  # the same contacts, as they were weighed
+            pushed = self._push_on(state, 0, settles=True, finishes=True)
+        if turns is not None:
+            turns.measure()
+        return pushed
 
     def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
         """A round of the first `STEPS` steps; asks for what `push` returns."""
@@ -323,6 +329,16 @@ class ContinuousContacts:
             self._conclude(self._pairs.outcome)
             self._velocities = box_of(state.velocity, 0, state.vertex_count, self._ends)
         return asked()
+
+
+class Turns(Protocol):
+    """Turns that springs take with contacts in a substep."""
+
+    def measure(self) -> None:
+        """Ask how long springs are."""
+
+    def relax(self) -> bool:
+        """Let springs change displacements where they were too long when measured; whether they did."""
 
 
 class ImpactZones:

@@ -413,33 +413,21 @@ def margin_after(is_changed: ti.i32, change: ti.f32, margin: ti.f32, least: ti.f
 
 
 @func
-def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: SubstepEnd):
-    """What a patch used up of the lists in a substep, and its margin for the next one. If contacts changed it by more
-    than `negligible` [m] it is fitted anew.
-    """
+def finish_patch(m: ti.i32, patches: MovingPatches, end: SubstepEnd):
+    """What a patch used up of the lists in a substep, and its margin for the next one."""
     (budget,) = ti.static((patches.budget,))
     margin, change = budget.margin[m], ti.select(end.is_changed == 1, budget.change[m], 0.0)
     budget.change[m] = change
     budget.spent[m] += budget.moves[m] + change + end.astray
     budget.margin[m] = margin_after(end.is_changed, change, margin, end.least_margin)
     budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
-    if change > end.negligible:
-        fit_motion(m, end.still, patches.corners, nodes, patches.bounds)
 
 
 @func
-def finish_pair(p: ti.i32, met: PatchPairArrays, patches: MovingPatches, negligible: ti.f32):
+def finish_pair(p: ti.i32, met: PatchPairArrays, budget: PatchBudget):
     """The same of a pair of patches."""
-    (budget,) = ti.static((patches.budget,))
     if met.slack[p] > 0.0:
-        m, other = met.pairs[p][0], met.pairs[p][1]
-        nearer = met.approach[p] + budget.change[m] + budget.change[other]
-        if ti.max(budget.change[m], budget.change[other]) > negligible:
-            nearer = approach_of(m, other, patches.bounds.motion)
-            # A patch that was not fitted anew moves as noted, but for its change.
-            nearer += ti.select(budget.change[m] > negligible, 0.0, budget.change[m])
-            nearer += ti.select(budget.change[other] > negligible, 0.0, budget.change[other])
-        met.slack[p] -= nearer
+        met.slack[p] -= met.approach[p] + budget.change[met.pairs[p][0]] + budget.change[met.pairs[p][1]]
 
 
 LARGEST_SHARE = 0.9
@@ -557,13 +545,13 @@ def end_contacts(
         stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, patches.corners.count, 0)
         m = next_item(-1, worker, counters.taken, 1, PATCHES_AT_A_TIME)
         while m < stop:
-            finish_patch(m, nodes, patches, end)
+            finish_patch(m, patches, end)
             m = next_item(m, worker, counters.taken, 1, PATCHES_AT_A_TIME)
     begin_sharing(counters.taken, 2)
     for worker in range(pairs_end):
         stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, met.count, 0)
         p = next_item(-1, worker, counters.taken, 2, PAIRS_AT_A_TIME)
         while p < stop:
-            finish_pair(p, met, patches, end.negligible)
+            finish_pair(p, met, patches.budget)
             p = next_item(p, worker, counters.taken, 2, PAIRS_AT_A_TIME)
     return ti.math.ivec3(counters.found[0], counters.found[1], counters.found[2])

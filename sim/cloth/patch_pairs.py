@@ -314,7 +314,6 @@ class PatchPairs:
         predicted: ti.Ndarray,
         contacts: ContactList,
         count: int,
-        negligible: float,
         *,
         is_changed: bool,
     ) -> Callable[[], list[int]]:
@@ -328,7 +327,6 @@ class PatchPairs:
             predicted: displacements as contacts were looked for.
             contacts: in the substep.
             count: of those that are tested.
-            negligible: what contacts may add without the motion of patches being looked at anew [m].
             is_changed: whether contacts changed displacements.
         """
         patches, half = self.patches, self._half_thickness
@@ -340,7 +338,7 @@ class PatchPairs:
             self._tracked(state),
             predicted,
             self._moving,
-            SubstepEnd(int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
+            SubstepEnd(int(is_changed), self._astray, MARGIN * 2.0 * half, half),
             self.on_device,
             (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
             self.counters,

@@ -30,9 +30,6 @@ LEAST_SKIN_IN_EDGES = 0.15
 """How far lists of pairs reach, and at least farther than the thickness, in mean edges, if motion does not ask for
 more: to last for many substeps at rest, but not list most neighbours in flat cloth, 0.9 mean edges and more off."""
 
-NEGLIGIBLE = 0.01
-"""Part of the thickness that contacts may add to the motion of a substep without it being looked at anew."""
-
 
 class SelfCollision:
     """Finds the pairs of cloth elements, of one cloth or several, that are near each other.
@@ -145,8 +142,8 @@ class SelfCollision:
             self.outcome = self._nothing
             return lambda: [0, 0, 0]
         self.outcome = self.patch_pairs.counters.found
-        self._was_changed, negligible = is_changed, NEGLIGIBLE * self.thickness
-        return self.patch_pairs.finish(state, predicted, contacts, count, negligible, is_changed=is_changed)
+        self._was_changed = is_changed
+        return self.patch_pairs.finish(state, predicted, contacts, count, is_changed=is_changed)
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.

@@ -1,5 +1,6 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
+import functools
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
@@ -49,6 +50,38 @@ FIXED_KEYS = frozenset(
     ("name", "shape", "position", "rotation_deg", "velocity", "material", "pin", "integrator", "substeps", "iterations")
 )
 """What cannot change between frames; all else can."""
+
+
+class SpringTurns:
+    """Turns that the springs of some cloths take with contacts in a substep of dt [s].
+
+    Attributes:
+        taken: how many.
+        is_measured: whether it was asked how long springs are.
+    """
+
+    def __init__(self, integrator: XPBDSprings | ExplicitSprings, dt: float, cloths: NDArray[np.bool_]) -> None:
+        self._integrator, self._dt, self._cloths = integrator, dt, cloths
+        self._asked: Callable[[], NDArray[np.float64]] | None = None
+        self.taken, self.is_measured = 0, False
+
+    def measure(self) -> None:
+        """Ask how long springs are, which the host hears of when it needs to."""
+        self._asked, self.is_measured = functools.cache(self._integrator.excess(self._dt)), True
+
+    @property
+    def excess(self) -> NDArray[np.float64]:
+        """What was measured last [rest lengths], (b,)."""
+        assert self._asked is not None
+        return self._asked()
+
+    def relax(self) -> bool:
+        """Solve springs once more if they were too long when measured; whether they were."""
+        if self.taken == MOST_TURNS or self.excess[self._cloths].max(initial=0.0) < RELAXED_BEYOND:
+            return False
+        self.taken += 1
+        self._integrator.sweep(self._dt, self._cloths)
+        return True
 
 
 class ClothSolver:
@@ -249,44 +282,28 @@ class ClothSolver:
         for. Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
         shortened for those that omit `substeps`.
         """
-        state, integrator, turns = self.state, self._integrator, 0
-        at_end: Callable[[], NDArray[np.float64]] | None = None
+        state, integrator = self.state, self._integrator
         integrator.displace(dt, np.where(self._adapts, self._sweeps, self._iterations))
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        excess = integrator.excess(dt)() if self._adapts.any() and is_loose else None
-        by_springs = 0.0 if excess is None else float(excess[self._adapts].max())
-
-        def relax() -> Callable[[], bool]:
-            measured = integrator.excess(dt)
-
-            def go_on() -> bool:
-                nonlocal turns, excess
-                excess = measured()
-                if turns == MOST_TURNS or excess[self._takes_turns].max(initial=0.0) < RELAXED_BEYOND:
-                    return False
-                turns += 1
-                integrator.sweep(dt, self._takes_turns)
-                return True
-
-            return go_on
+        turns = SpringTurns(integrator, dt, self._takes_turns)
+        if self._adapts.any() and is_loose:
+            turns.measure()
+        by_springs = float(turns.excess[self._adapts].max()) if turns.is_measured else 0.0
 
         def conclude(reasons: ti.Ndarray) -> None:
-            nonlocal at_end
-            if excess is None:
-                at_end = integrator.excess(dt)
+            if not turns.is_measured:
+                turns.measure()
             finish_step(state.nodes, state.position, state.limit, dt, reasons)
 
-        if self.contacts is None or not self.contacts.resolve(state, dt, relax, conclude):
+        if self.contacts is None or not self.contacts.resolve(state, dt, turns, conclude):
             conclude(self._no_reasons)
-        if excess is None:
-            assert at_end is not None
-            excess = at_end()
+        excess = turns.excess
         self._excess = float(excess[self._refines].max(initial=0.0))
         if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2
         elif is_loose and self._excess > REFINED_BEYOND:
             self._refinement = min(2 * self._refinement, MOST_REFINED)
-        elif self._excess < LENGTHENED_BELOW and turns < 2:
+        elif self._excess < LENGTHENED_BELOW and turns.taken < 2:
             self._refinement = max(self._refinement // 2, 1)
         if by_springs < RESTORED_BELOW:
             self._sweeps = max(self._sweeps // 2, 1)

@@ -75,7 +75,7 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
     state = solver.state
     state.displacement.from_numpy(displacement.astype(np.float32))
     if solver.contacts is not None:
-        solver.contacts.resolve(state, dt, lambda: lambda: False)
+        solver.contacts.resolve(state, dt)
     allowed = state.displacement.to_numpy().astype(np.float64)
     finish_step(state.nodes, state.position, state.limit, dt, solver._no_reasons)
     return allowed
