@@ -95,6 +95,11 @@ class DeviceSprings:
         law = np.stack([self.host.rest, self.stiffness, self.damping], axis=1)
         self.on_device.law.from_numpy(law.astype(np.float32))
 
+    def of_cloths(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A number of each cloth for each of its springs, (count,)."""
+        own: NDArray[np.float64] = values[self._cloth_of]
+        return own
+
     def contract(self, nodes: Nodes, displacement: ti.Ndarray) -> None:
         """Let springs of threads feel the strain across, as nodes are displaced: with tensions C (e_u + nu e_v).
 
@@ -141,6 +146,12 @@ def measure_contraction(
         i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
         across = 0.5 * (contraction.strain[2 * i + other] + contraction.strain[2 * j + other])
         springs.shift[s] = contraction.poisson[s] * springs.law[s][0] * across
+
+
+@ti.func
+def offset_of(strain: ti.f32, ahead: ti.f32, shares: ti.math.vec2) -> ti.f32:
+    """By how much a strain is felt as less that velocities at the start of a step would make so much larger in it."""
+    return strain * (1.0 - 1.0 / shares[0]) + shares[1] / shares[0] * ahead
 
 
 @func
