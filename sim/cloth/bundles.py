@@ -326,8 +326,7 @@ class Ageing(NamedTuple):
 
     thickness: ti.f32  # the largest [m]
     least_skin: ti.f32  # how far beyond to search at least [m]
-    first_due: Floats  # the largest `due` of the vertices with triangles of each pair [m], (p,)
-    first_due_of_edges: Floats
+    first_due: Floats  # `PairPieces.piece_due`, (2 p,)
 
 
 @bundle
@@ -343,23 +342,15 @@ class Counters(NamedTuple):
 
 @bundle
 class PairPieces(NamedTuple):
-    """A list of pairs of elements, in pieces, one of each of p pairs of patches; see `PairList`."""
+    """Listed pairs of elements, in two pieces of each of p pairs of patches: vertices with triangles, and edges."""
 
-    pieces: Quadruples  # first place, places, and how many of them are taken, (p,)
-    piece_due: Floats  # the largest `due` of each piece [m], `NEVER` where nothing is listed, (p,)
-    again: Integers  # numbers of the pieces that were too short, and are searched again, (p,)
+    pieces: Quadruples  # first place, places, and how many of them are taken, (2 p,)
+    piece_due: Floats  # the largest `due` of each piece [m], `NEVER` where nothing is listed, (2 p,)
+    again: Integers  # numbers of the pieces that were too short, and are searched again, (2 p,)
+    ends: Integers  # of all pieces; and how many are searched again, (2,)
     pairs: Quadruples  # a vertex and a triangle's corners, or the ends of two edges
     wanted: Floats  # distance that they keep [m]; `UNKNOWN` until they have come so near that it matters
     due: Floats  # they are looked at when `PatchPairArrays.left` is not above it [m]
-
-
-@bundle
-class PairLists(NamedTuple):
-    """Both lists of pairs of elements."""
-
-    triangles: PairPieces  # of vertices with triangles
-    edges: PairPieces
-    ends: Integers  # of both lists; then how many pieces are to be searched again, (4,)
 
 
 @bundle
@@ -414,7 +405,7 @@ class Contacts(NamedTuple):
     arm: Vectors  # from the body's centre of mass to the point [m]; then, if it `drifts`, how the surface does [m]
     drifts: ti.template()  # whether any body deforms
     friction: Floats  # Coulomb's coefficient [-]
-    counter: Integers  # (5,)
+    counter: Integers  # (4,)
     capacity: ti.i32
 
 

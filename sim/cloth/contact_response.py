@@ -221,7 +221,7 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     """
     contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end = contacts.counter[3], vertex_count
+    contacts_end, vertices_end = contacts.counter[2], vertex_count
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
@@ -506,7 +506,7 @@ def push(
     moved_end = touched_count + r.bodies.count
     new_end = starts * ti.max(pushing_count, moved_end)
     finished_end, finished_moved_end = finishes * pushing_count, finishes * moved_end
-    settled_end = settles * sums.counter[4] * contacts.counter[3]
+    settled_end = settles * sums.counter[4] * contacts.counter[2]
     whole_end = whole_warps(settled_end)
     sums.counter[3] = 0
     settle_all(settled_end, whole_end, r)

@@ -242,8 +242,8 @@ class ContinuousContacts:
                     return -1, None
                 if not self._pairs.looked()[1]:
                     continue
-            found, *ends = asked()
-            had_no_room = self._pairs.make_room_for(ends)
+            found, end = asked()
+            had_no_room = self._pairs.listed.reach_to(end)
             if not self._contacts.make_room_for(found) and not had_no_room:
                 return found, pushed
 

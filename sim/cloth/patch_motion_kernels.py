@@ -369,9 +369,9 @@ def age_pair(
                 met.needed[m], met.needed[other] = 1, 1
         if met.wake[p] < 0.0:
             met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
-            if is_searched or ageing.first_due[p] >= met.left[p] or ageing.first_due_of_edges[p] >= met.left[p]:
+            if is_searched or ti.max(ageing.first_due[2 * p], ageing.first_due[2 * p + 1]) >= met.left[p]:
                 met.due[ti.atomic_add(counter[1], 1)] = p
-                ageing.first_due[p], ageing.first_due_of_edges[p] = NEVER, NEVER
+                ageing.first_due[2 * p], ageing.first_due[2 * p + 1] = NEVER, NEVER
 
 
 @func

@@ -507,13 +507,13 @@ def find_rigid_contacts(
     largest_half: ti.f32,
     near: Touching,
     meets: ti.template(),
-) -> ti.math.ivec3:
+) -> ti.math.ivec2:
     """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if cloth `meets` bodies,
     also with these, and if some show between vertices, those of triangles, each at its deepest point.
 
     Parallel however few there are: compiled twice, normals would be rounded differently. `work` has the threads that
-    share a patch, and workers (`sim.core.scheduling`). Returns the numbers of the list's counter, whose first is 0
-    then.
+    share a patch, and workers (`sim.core.scheduling`). Returns the first two numbers of the list's counter, of which
+    one is 0 then.
     """
     vertices, elements, surface, contacts = ti.static((patches.vertices, patches.elements, near.surface, near.contacts))
     walls, bodies = ti.static((near.walls, near.bodies))
@@ -559,8 +559,8 @@ def find_rigid_contacts(
                                 touch_triangle(b, corners, allowed, near)
                         place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
-    found = ti.math.ivec3(contacts.counter[0], contacts.counter[1], contacts.counter[2])
-    contacts.counter[3] = ti.select(contacts.counter[4] == 1 and found[0] <= contacts.capacity, found[0], 0)
+    found = ti.math.ivec2(contacts.counter[0], contacts.counter[1])
+    contacts.counter[2] = ti.select(contacts.counter[3] == 1 and found[0] <= contacts.capacity, found[0], 0)
     contacts.counter[0] = 0
     return found
 

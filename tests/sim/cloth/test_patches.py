@@ -200,9 +200,10 @@ def test_pairs_keep_a_changed_thickness_where_a_thicker_cloth_changes_nothing():
     pairs.look(state)
     find(state, pairs)
     assert pairs.thickness == np.float32(0.008)
-    for each in (pairs.with_triangles, pairs.of_edges):
-        places = listed_places(pairs, each)
-        vertices, wanted = each.on_device.pairs.to_numpy()[places], each.on_device.wanted.to_numpy()[places]
+    listed = pairs.listed.on_device
+    for are_edges in (False, True):
+        places = listed_places(pairs, are_edges)
+        vertices, wanted = listed.pairs.to_numpy()[places], listed.wanted.to_numpy()[places]
         body = state.host.body[vertices]
         # What pairs keep is asked for when they are near: these are 1.1 mm apart, and a spacing or so aside.
         across = (wanted != UNKNOWN) & (body[:, 0] != body[:, 2])
@@ -241,8 +242,7 @@ def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
     state = state_of(13)
     roomy, tight = SelfCollision(state), SelfCollision(state)
     for pairs, capacity in ((roomy, 10**5), (tight, 1)):
-        pairs.with_triangles.resize(capacity)
-        pairs.of_edges.resize(capacity)
+        pairs.listed.resize(capacity)
         crumple(state, pairs, 40)
     assert min(len(each) for each in listed_pairs(tight)) > 100
     assert listed_pairs(tight) == listed_pairs(roomy)
