@@ -197,22 +197,14 @@ class PatchNodes(NamedTuple):
 
 
 @bundle
-class PatchElements(NamedTuple):
-    """Edges and triangles in lists, one of each patch."""
+class PatchLists(NamedTuple):
+    """What of the cloth each patch has, in lists: its own nodes, its edges and triangles."""
 
-    count: ti.i32  # of the patches
+    vertices: PatchNodes
     first_edge: Integers  # (m + 1,)
     edges: Pairs
     first_triangle: Integers  # (m + 1,)
     triangles: Triples
-
-
-@bundle
-class PatchLists(NamedTuple):
-    """What of the cloth each patch has: its own nodes, its edges and triangles."""
-
-    vertices: PatchNodes
-    elements: PatchElements
 
 
 @bundle

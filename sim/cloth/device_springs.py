@@ -51,11 +51,11 @@ class DeviceSprings:
             the last group may have empty ones.
         in_segments: whether these are threads.
         host: the springs on the host.
-        cloths: numbers of the cloths that they belong to.
+        cloths: numbers of the cloths that they belong to; `cloth_of` that of each, (count,).
     """
 
     def __init__(self, springs: Springs, cloth_of: NDArray[np.int32]) -> None:
-        self.host, self._cloth_of = springs, cloth_of
+        self.host, self.cloth_of = springs, cloth_of
         self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = springs.arity, len(springs)
         self.in_segments = springs.in_segments
@@ -83,22 +83,17 @@ class DeviceSprings:
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
         for number, cloth in enumerate(cloths):
-            own = self._cloth_of == number
+            own = self.cloth_of == number
             self.stiffness[own] = self.host.stiffness(cloth)[own]
             self.damping[own] = self.host.damping(cloth)[own]
         self.is_damped = bool((self.stiffness * self.damping).any())
         if self.in_segments:
-            self.poisson = np.array([cloth.poisson_ratio for cloth in cloths])[self._cloth_of]
+            self.poisson = np.array([cloth.poisson_ratio for cloth in cloths])[self.cloth_of]
             self._contraction.poisson.from_numpy(self.poisson.astype(np.float32))
             self.contracts = bool(self.poisson.any())
             self.on_device.shift.fill(0.0)
         law = np.stack([self.host.rest, self.stiffness, self.damping], axis=1)
         self.on_device.law.from_numpy(law.astype(np.float32))
-
-    def of_cloths(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A number of each cloth for each of its springs, (count,)."""
-        own: NDArray[np.float64] = values[self._cloth_of]
-        return own
 
     def contract(self, nodes: Nodes, displacement: ti.Ndarray) -> None:
         """Let springs of threads feel the strain across, as nodes are displaced: with tensions C (e_u + nu e_v).

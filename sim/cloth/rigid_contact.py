@@ -307,7 +307,7 @@ class RigidContact:
         is_alone, shows = not (self._walls.count or self.bodies.count), self._shows.any()
         lanes = on_gpu(LANES if shows else LANES_OF_VERTICES)
         return find_rigid_contacts.later(
-            PatchLists(patches.vertex_lists, patches.elements),
+            patches.lists,
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
             self._taken,
             motion,
@@ -515,7 +515,7 @@ def find_rigid_contacts(
     share a patch, and workers (`sim.core.scheduling`). Returns the first two numbers of the list's counter, of which
     one is 0 then.
     """
-    vertices, elements, surface, contacts = ti.static((patches.vertices, patches.elements, near.surface, near.contacts))
+    vertices, surface, contacts = ti.static((patches.vertices, near.surface, near.contacts))
     walls, bodies = ti.static((near.walls, near.bodies))
     lanes, workers_end = work[0], work[1]
     begin_sharing(taken, 0)
@@ -543,16 +543,16 @@ def find_rigid_contacts(
                     place += lanes
                 if ti.static(meets == SHOWN_BODIES):
                     # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
-                    edges = elements.first_edge[m + 1] - elements.first_edge[m]
-                    end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
+                    edges = patches.first_edge[m + 1] - patches.first_edge[m]
+                    end = edges + patches.first_triangle[m + 1] - patches.first_triangle[m]
                     place = ti.select(is_near, item % lanes, end)
                     while place < end:
                         corners = Three(0)
                         if place < edges:
-                            ends = elements.edges[elements.first_edge[m] + place]
+                            ends = patches.edges[patches.first_edge[m] + place]
                             corners = Three(ends[0], ends[1], ends[1])
                         else:
-                            corners = elements.triangles[elements.first_triangle[m] + place - edges]
+                            corners = patches.triangles[patches.first_triangle[m] + place - edges]
                         for b in range(bodies.count):
                             passes = bodies.passes[near.cloth[corners[0]] * bodies.count + b] == 1
                             if bodies.shows[b] > ti.cast(place < edges, ti.i32) and not passes:

@@ -78,7 +78,7 @@ class ThreadSolver:
     def resolve_waves(self, resolved: NDArray[np.float64]) -> None:
         """Say how far steps resolve the waves of each cloth (`springs.resolved_share`), (b,)."""
         self._resolves = bool(resolved[list(self.springs.cloths)].any())
-        shares = newmark_shares(self.springs.of_cloths(resolved), KEPT_BY_THREADS)
+        shares = newmark_shares(resolved[self.springs.cloth_of], KEPT_BY_THREADS)
         self._work.shares.from_numpy(shares.astype(np.float32))
         self._work.offset.fill(0.0)
 
