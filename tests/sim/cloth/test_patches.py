@@ -121,8 +121,7 @@ def test_a_cloth_of_one_patch_meets_itself():
 def finish(state, pairs: SelfCollision, predicted: ti.Ndarray | None = None) -> list[int]:
     """A substep is over, with displacements that contacts changed from those `predicted`."""
     is_changed, predicted = predicted is not None, state.displacement if predicted is None else predicted
-    rounds = 0, ti.ndarray(ti.i32, 5), state.rounds
-    return pairs.finish(state, predicted, ContactList(1), 0, rounds, is_changed=is_changed)()
+    return pairs.finish(state, predicted, ContactList(1), 0, is_changed=is_changed)()
 
 
 def crumple(state, pairs: SelfCollision, count: int) -> None:
