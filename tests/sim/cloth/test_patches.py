@@ -58,12 +58,11 @@ def test_patches_of_very_uneven_meshes_have_like_numbers_of_triangles():
     assert sizes.min() >= TRIANGLES_PER_PATCH // 2
 
 
-def nothing_due(met: PatchPairs) -> tuple[ti.Ndarray, ti.Ndarray]:
-    """As lists have it in which nothing is listed."""
-    arrays = tuple(ti.ndarray(ti.f32, met.capacity) for _ in range(2))
-    for array in arrays:
-        array.fill(-1.0e30)
-    return arrays
+def nothing_due(met: PatchPairs) -> ti.Ndarray:
+    """As a list has it in which nothing is listed."""
+    due = ti.ndarray(ti.f32, 2 * met.capacity)
+    due.fill(-1.0e30)
+    return due
 
 
 def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
@@ -77,7 +76,7 @@ def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     collides.fill(1)
     met.meet(1.0, 1.0, collides)
     # All are searched: none are so far apart that they might sleep.
-    assert met.age(state, Ageing(1.0, 0.0, *nothing_due(met))) == met.count
+    assert met.age(state, Ageing(1.0, 0.0, nothing_due(met))) == met.count
     assert met.count == patches.count * (patches.count + 1) // 2
     corners = pieces(patches.corners, patches.first_corner)
     return met.on_device.approach.to_numpy()[: met.count], met.on_device.pairs.to_numpy()[: met.count], corners
