@@ -78,7 +78,9 @@ class CellArrays(NamedTuple):
     across: Floats  # c_a of d_v [1/m], (arity s,)
     law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
     cell_of_colour: Integers  # first cell of each colour, and number of cells, (colours + 1,)
-    multiplier: Floats  # of the shear, (s,); rectangles only
+    multiplier: Floats  # of the shear, (s,); rectangles only, as what follows
+    shares: Strains  # see `springs.newmark_shares`, (s,)
+    offset: Floats  # by which these have the shear felt as less, (s,)
 
 
 @bundle
@@ -163,6 +165,8 @@ class ThreadWork(NamedTuple):
     change: Floats  # of the multiplier, as far as known
     factor: Floats  # of the change of the spring before
     is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
+    shares: Strains  # see `springs.newmark_shares`
+    offset: Floats  # by which these have a spring felt as shorter [m]
 
 
 @bundle
@@ -193,22 +197,14 @@ class PatchNodes(NamedTuple):
 
 
 @bundle
-class PatchElements(NamedTuple):
-    """Edges and triangles in lists, one of each patch."""
+class PatchLists(NamedTuple):
+    """What of the cloth each patch has, in lists: its own nodes, its edges and triangles."""
 
-    count: ti.i32  # of the patches
+    vertices: PatchNodes
     first_edge: Integers  # (m + 1,)
     edges: Pairs
     first_triangle: Integers  # (m + 1,)
     triangles: Triples
-
-
-@bundle
-class PatchLists(NamedTuple):
-    """What of the cloth each patch has: its own nodes, its edges and triangles."""
-
-    vertices: PatchNodes
-    elements: PatchElements
 
 
 @bundle
@@ -272,15 +268,10 @@ class MovingPatches(NamedTuple):
 
 @bundle
 class SubstepEnd(NamedTuple):
-    """Limits by which patches finish a substep, and what contacts say of its end."""
+    """Limits by which patches finish a substep."""
 
-    is_ahead: ti.i32  # whether it only ends if rounds do, with all contacts as they should be
-    counter: Integers  # see `NodeSums`
-    rounds: Integers  # see `ClothState`
     is_changed: ti.i32  # whether contacts displaced anything
     astray: ti.f32  # largest distance of a vertex from where it was expected [m]
-    still: ti.f32  # differences of displacements that are not fitted [m]
-    negligible: ti.f32  # displacement by contacts after which a patch is not fitted anew [m]
     least_margin: ti.f32  # [m]
     half_thickness: ti.f32  # [m]
 
@@ -327,8 +318,7 @@ class Ageing(NamedTuple):
 
     thickness: ti.f32  # the largest [m]
     least_skin: ti.f32  # how far beyond to search at least [m]
-    first_due: Floats  # the largest `due` of the vertices with triangles of each pair [m], (p,)
-    first_due_of_edges: Floats
+    first_due: Floats  # `PairPieces.piece_due`, (2 p,)
 
 
 @bundle
@@ -344,23 +334,15 @@ class Counters(NamedTuple):
 
 @bundle
 class PairPieces(NamedTuple):
-    """A list of pairs of elements, in pieces, one of each of p pairs of patches; see `PairList`."""
+    """Listed pairs of elements, in two pieces of each of p pairs of patches: vertices with triangles, and edges."""
 
-    pieces: Quadruples  # first place, places, and how many of them are taken, (p,)
-    piece_due: Floats  # the largest `due` of each piece [m], `NEVER` where nothing is listed, (p,)
-    again: Integers  # numbers of the pieces that were too short, and are searched again, (p,)
+    pieces: Quadruples  # first place, places, and how many of them are taken, (2 p,)
+    piece_due: Floats  # the largest `due` of each piece [m], `NEVER` where nothing is listed, (2 p,)
+    again: Integers  # numbers of the pieces that were too short, and are searched again, (2 p,)
+    ends: Integers  # of all pieces; and how many are searched again, (2,)
     pairs: Quadruples  # a vertex and a triangle's corners, or the ends of two edges
     wanted: Floats  # distance that they keep [m]; `UNKNOWN` until they have come so near that it matters
     due: Floats  # they are looked at when `PatchPairArrays.left` is not above it [m]
-
-
-@bundle
-class PairLists(NamedTuple):
-    """Both lists of pairs of elements."""
-
-    triangles: PairPieces  # of vertices with triangles
-    edges: PairPieces
-    ends: Integers  # of both lists; then how many pieces are to be searched again, (4,)
 
 
 @bundle
@@ -415,7 +397,7 @@ class Contacts(NamedTuple):
     arm: Vectors  # from the body's centre of mass to the point [m]; then, if it `drifts`, how the surface does [m]
     drifts: ti.template()  # whether any body deforms
     friction: Floats  # Coulomb's coefficient [-]
-    counter: Integers  # (5,)
+    counter: Integers  # (4,)
     capacity: ti.i32
 
 
@@ -462,7 +444,6 @@ class NodeSums(NamedTuple):
     """Numbers of each node that are found as contacts are weighed."""
 
     counter: Integers  # contacts that push, their nodes, and uses; whether any misses much, is settled, (5,)
-    rounds: Integers  # see `ClothState`
     predicted: Vectors  # displacement as contacts were looked for [m], (n,)
     shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
     held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)

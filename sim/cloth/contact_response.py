@@ -26,7 +26,6 @@ import taichi as ti
 from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, Response
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import INACTIVE, WALL
-from sim.cloth.state import GO_ON, OVER, OVER_WITH_MORE
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import large_kernel
@@ -222,11 +221,10 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     """
     contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end = contacts.counter[3], vertex_count
+    contacts_end, vertices_end = contacts.counter[2], vertex_count
     all_end = ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         sums.counter[k] = 0
-    sums.rounds[0] = ti.select(is_first == 1, GO_ON, OVER)
     for i in range(all_end):
         if i < vertex_count:
             sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
@@ -491,48 +489,26 @@ def leave_body(b: ti.i32, r: Response):
 
 TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they should keep
 
-NOT_AHEAD, OF_TURN, OF_MORE_STEPS = range(3)
-"""Whether steps were asked for before it was known that they are needed: those of another turn of springs, or more
-where a round was not enough."""
-
-Pushed = ti.types.vector(5, ti.i32)
-
 
 @large_kernel
 def push(
-    momenta: Momenta,
-    starts: ti.i32,
-    settles: ti.i32,
-    finishes: ti.i32,
-    is_ahead: ti.i32,
-    r: Response,
-    thickness: Floats,
-) -> Pushed:
+    momenta: Momenta, starts: ti.i32, settles: ti.i32, finishes: ti.i32, r: Response, thickness: Floats
+) -> ti.math.ivec4:
     """Some steps of the iteration of a round of contacts that were weighed (`weigh_contacts`), and where they lead if
-    it `finishes`; first those that one step solves, if it `settles` them. If it `is_ahead`, nothing is done unless it
-    is needed: `OF_TURN` if rounds go on, `OF_MORE_STEPS` if they are over, and some contact misses what it should keep.
+    it `finishes`; first those that one step solves, if it `settles` them.
 
     Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
-    `TOLERANCE` then, whether any are settled, and whether more steps were needed, and done.
+    `TOLERANCE` then, and whether any are settled.
     """
     contacts, sums = ti.static((r.contacts, r.sums))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    goes_on = 1
-    if is_ahead == OF_TURN:
-        goes_on = ti.cast(sums.rounds[0] == GO_ON, ti.i32)
-    elif is_ahead == OF_MORE_STEPS:
-        goes_on = ti.cast(sums.rounds[0] == OVER and sums.counter[0] > 0 and sums.counter[3] == 1, ti.i32)
-    pushing_count, touched_count = goes_on * sums.counter[0], goes_on * sums.counter[1]
-    moved_end = touched_count + goes_on * r.bodies.count
+    pushing_count, touched_count = sums.counter[0], sums.counter[1]
+    moved_end = touched_count + r.bodies.count
     new_end = starts * ti.max(pushing_count, moved_end)
     finished_end, finished_moved_end = finishes * pushing_count, finishes * moved_end
-    settled_end = goes_on * settles * sums.counter[4] * contacts.counter[3]
+    settled_end = settles * sums.counter[4] * contacts.counter[2]
     whole_end = whole_warps(settled_end)
-    sums.rounds[2] = sums.counter[0] + sums.counter[4]
-    if goes_on * finishes == 1:
-        sums.counter[3] = 0
-        if is_ahead == OF_MORE_STEPS:
-            sums.rounds[0] = OVER_WITH_MORE
+    sums.counter[3] = 0
     settle_all(settled_end, whole_end, r)
     push_apart(momenta, new_end, pushing_count, touched_count, moved_end, r)
     finish_push(finished_end, touched_count, finished_moved_end, r)
@@ -542,5 +518,4 @@ def push(
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
             sums.counter[3] = 1
-    is_more = ti.cast(sums.rounds[0] == OVER_WITH_MORE, ti.i32)
-    return Pushed(sums.counter[0], sums.counter[1], sums.counter[3], sums.counter[4], is_more)
+    return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])

@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -14,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import NodeSums, PushedNodes, Response
-from sim.cloth.contact_response import NOT_AHEAD, OF_MORE_STEPS, OF_TURN, STEPS, push, weigh_contacts
+from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
@@ -23,8 +24,8 @@ from sim.core.bundles import with_room
 from sim.core.host_access import copied, take
 from sim.core.reductions import LaneReduction, runs_on_gpu
 
-MORE_ITERATIONS = 2 * STEPS
-"""Steps of the contact iteration that follow the first `STEPS` where those are not enough, as
+MORE_ITERATIONS = 16
+"""Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
 in stacks and impacts; two layers under their weight need one step."""
 
 REPAIRS = 4  # rounds in which crossing pairs are pushed before they become impact zones
@@ -80,16 +81,12 @@ class ContinuousContacts:
             uses=ti.ndarray(ti.i32, 2 * n),
         )
         self._sums: NodeSums = with_room(
-            NodeSums,
-            n,
-            counter=ti.ndarray(ti.i32, 5),
-            held_sums=ti.ndarray(ti.i32, 6 * n),
-            rounds=state.rounds,
+            NodeSums, n, counter=ti.ndarray(ti.i32, 5), held_sums=ti.ndarray(ti.i32, 6 * n)
         )
         self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
-        self._is_warm = self._expects = self._foresees_more = False
+        self._is_warm = self._expects = False
         self._conclude: Callable[[ti.Ndarray], None] | None = None
         self.begin_frame()
 
@@ -183,12 +180,11 @@ class ContinuousContacts:
         Args:
             state: with displacements.
             dt: [s].
-            turns: of springs, which change displacements once more where contacts stretched them too much, and
-                contacts are resolved again then.
+            turns: that springs take, where contacts stretched them too much; contacts are resolved again then.
             conclude: has the device finish the step if three numbers there are 0, as they are where nothing remains to
                 be done: a GPU would wait while the host reads them.
         """
-        self._conclude, turns = conclude, turns or Turns()
+        self._conclude = conclude
         self._pairs.look(state)
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
@@ -197,13 +193,14 @@ class ContinuousContacts:
             self._warm_up(state)
             self._is_warm = True
         while True:
-            found, begun = self._find(state, dt, turns)
+            found, pushed = self._find(state, dt, turns)
             if found < 0:
                 self._contacts.forget()
                 self._velocities = None
                 return False  # the solver says which quantity is not finite, or ran away
-            is_ended = found > 0 and self._push_in_turns(state, turns, begun and begun[0])
-            left, is_beyond, not_finite = self._keep_apart(state, found, begun[1] if begun and is_ended else None)
+            if found:
+                self._push_in_turns(state, turns, pushed)
+            left, is_beyond, not_finite = self._keep_apart(state, found)
             if not_finite:
                 self._velocities = None
                 return False  # as above
@@ -224,16 +221,12 @@ class ContinuousContacts:
         if self._pairs.meets:
             self._pairs.warm_up()
 
-    def _find(
-        self, state: ClothState, dt: float, turns: Turns
-    ) -> tuple[int, tuple[Callable[[], list[int]], Callable[[], Sequence[int]]] | None]:
-        """Number of contacts, or -1 where cloth has no bounds; and a first round of pushes, and the end, where these
-        have begun.
+    def _find(self, state: ClothState, dt: float, turns: Turns | None) -> tuple[int, Callable[[], list[int]] | None]:
+        """Number of contacts, or -1 where cloth has no bounds; and a first round of pushes, where that has begun.
 
-        They have on a GPU, where there were contacts in the last substep: so the device need not wait for the host. It
-        goes on with as many turns as it took then, where these are needed, and ends if no more are.
+        It has on a GPU, where there were contacts in the last substep: so the device need not wait for the host.
         """
-        recovery, begun = min(1.0, dt / RECOVERY_TIME_S), None
+        recovery, pushed = min(1.0, dt / RECOVERY_TIME_S), None
         is_ahead = self._expects and runs_on_gpu()
         while True:
             if not is_ahead and not self._has_bounds():
@@ -244,144 +237,108 @@ class ContinuousContacts:
                 state, self._patches, met.bounds.motion, met.budget.margin, self._contacts, recovery
             )
             if is_ahead:
-                pushed = self._begin_push(state, is_first=True)
-                turns.ask()
-                for turn in range(turns.foreseen):
-                    turns.take(is_ahead=True)
-                    pushed = self._push_on(state, 0, settles=True, finishes=True, ahead=OF_TURN)
-                    turns.ask(ahead=turn + 1)
-                if self._foresees_more and turns.decides:
-                    pushed = self._push_more(state, is_ahead=True)
-                begun = pushed, self._finish(state, self._contacts.capacity, is_changed=True, is_ahead=True)
+                pushed = self._push_and_measure(state, turns)
                 if not self._has_bounds():
                     return -1, None
                 if not self._pairs.looked()[1]:
                     continue
-            found, *ends = asked()
-            had_no_room = self._pairs.make_room_for(ends)
+            found, end = asked()
+            had_no_room = self._pairs.listed.reach_to(end)
             if not self._contacts.make_room_for(found) and not had_no_room:
-                return found, begun
+                return found, pushed
 
     def _has_bounds(self) -> bool:
         """Whether what was looked at moves within reason."""
         motion, _ = self._pairs.looked()
         return math.isfinite(motion) and motion <= 1.0e6
 
-    def _push_in_turns(self, state: ClothState, turns: Turns, pushed: Callable[[], list[int]] | None) -> bool:
-        """Push in turns with the springs, for as long as these go on; rounds may have `pushed` already. Returns whether
-        nothing was done but these.
-        """
-        is_ahead, before = pushed is not None, turns.taken
+    def _push_in_turns(self, state: ClothState, turns: Turns | None, pushed: Callable[[], list[int]] | None) -> None:
+        """Push in turns with the springs, for as long as these need them; the first round may have `pushed` already."""
         if pushed is None:
-            pushed = self._begin_push(state, is_first=True)
-            turns.ask()
+            pushed = self._push_and_measure(state, turns)
         while True:
             found = pushed()
-            pushing, _, is_missing, settled, had_more = found
-            if not turns.go_on(pushes=bool(pushing or settled)):
+            pushing, _, _, settled = found
+            if turns is None or not (pushing or settled) or not turns.relax():
                 break
-            is_ahead = False
-            turns.take()
-            pushed = self._push_on(state, 0, settles=True, finishes=True)
-            turns.ask()
-        self._iterations += (turns.taken - before) * (STEPS if pushing else settled)
-        self._foresees_more = self._push_further(state, found)
-        return is_ahead and turns.decides and bool(had_more or not (pushing and is_missing))
+            self._iterations += STEPS if pushing else settled
+            pushed = self._push_and_measure(state, turns, is_first=False)
+        self._push_further(state, found)
 
-    def _push_further(self, state: ClothState, found: Sequence[int]) -> bool:
-        """More steps, where the round that `found` what `push` returns was not enough; returns whether it was not."""
-        pushing, _, is_missing, settled, had_more = found
+    def _push_further(self, state: ClothState, found: Sequence[int]) -> None:
+        """More steps, where the round that `found` what `push` returns was not enough."""
+        pushing, _, is_missing, settled = found
         self._iterations += STEPS if pushing else settled
-        if pushing and is_missing and not had_more:
-            self._push_more(state)
-            had_more = True
-        self._iterations += MORE_ITERATIONS if had_more else 0
-        return bool(had_more)
+        if pushing and is_missing:
+            for step in range(0, MORE_ITERATIONS, STEPS):
+                self._push_on(state, step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
+            self._iterations += MORE_ITERATIONS
 
-    def _push_more(self, state: ClothState, *, is_ahead: bool = False) -> Callable[[], list[int]]:
-        """More steps; asks for what `push` returns."""
-        ahead = OF_MORE_STEPS if is_ahead else NOT_AHEAD
-        self._push_on(state, 0, settles=False, finishes=False, ahead=ahead)
-        return self._push_on(state, STEPS, settles=False, finishes=True, ahead=ahead)
+    def _push_and_measure(
+        self, state: ClothState, turns: Turns | None, *, is_first: bool = True
+    ) -> Callable[[], list[int]]:
+        """A round of steps, and how long springs are after it; asks for what `push` returns."""
+        if is_first:
+            pushed = self._begin_push(state, is_first=True)
+        else:  # the same contacts, as they were weighed
+            pushed = self._push_on(state, 0, settles=True, finishes=True)
+        if turns is not None:
+            turns.measure()
+        return pushed
 
     def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
         """A round of the first `STEPS` steps; asks for what `push` returns."""
         weigh_contacts(self._response, state.vertex_count, int(is_first))
         return self._push_on(state, 0, settles=True, finishes=True)
 
-    def _push_on(
-        self, state: ClothState, first: int, *, settles: bool, finishes: bool, ahead: int = NOT_AHEAD
-    ) -> Callable[[], list[int]]:
+    def _push_on(self, state: ClothState, first: int, *, settles: bool, finishes: bool) -> Callable[[], list[int]]:
         """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
-        flags = (int(flag) for flag in (first == 0, settles, finishes))
-        return push.later(_momenta_from(first), *flags, ahead, self._response, state.thickness)
+        momenta = _momenta_from(first)
+        return push.later(momenta, int(first == 0), int(settles), int(finishes), self._response, state.thickness)
 
     @property
     def _response(self) -> Response:
         impulses = self._contacts.impulses(self._impulse_unit)
         return Response(self._contacts.found, impulses, self._pushed, self._sums, self.rigid.bodies.pushed)
 
-    def _keep_apart(
-        self, state: ClothState, count: int, ended: Callable[[], Sequence[int]] | None = None
-    ) -> Sequence[int]:
-        """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then.
-
-        The end of the substep may have been tried, and have `ended` it.
-        """
-        for attempt in range(REPAIRS):
-            asked = ended if ended is not None and attempt == 0 else self._finish(state, count)
-            found = asked()
+    def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
+        """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""
+        for _ in range(REPAIRS):
+            found = self._finish(state, count)
             if not found[0]:
                 return found
             self._repaired += found[0]
             self._push_further(state, self._begin_push(state, is_first=False)())
-        found = self._finish(state, count)()
+        found = self._finish(state, count)
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
             while found[0] and zones.join(
                 contacts.found.vertices.to_numpy()[:count][contacts.crossing.to_numpy()[:count] == 1]
             ):
                 state.displacement.from_numpy(zones.apply(state.displacement.to_numpy()))
-                found = self._finish(state, count)()
+                found = self._finish(state, count)
             self._zone_vertices += len(zones.members)
             of_cloths = np.bincount(state.host.body[zones.members], minlength=len(self._nodes_as_one))
             np.maximum(self._nodes_as_one, of_cloths, out=self._nodes_as_one)
-        return found if not found[0] else (found[0], *self._finish(state, 0, is_changed=True)()[1:])
+        return found if not found[0] else (found[0], *self._finish(state, 0, is_changed=True)[1:])
 
-    def _finish(
-        self, state: ClothState, count: int, *, is_changed: bool | None = None, is_ahead: bool = False
-    ) -> Callable[[], Sequence[int]]:
-        """Try to end the substep; asks for what `SelfCollision.finish` returns."""
+    def _finish(self, state: ClothState, count: int, *, is_changed: bool | None = None) -> Sequence[int]:
         is_changed = count > 0 if is_changed is None else is_changed
-        rounds = int(is_ahead), self._sums.counter, self._sums.rounds
-        predicted, contacts = self._sums.predicted, self._contacts
-        asked = self._pairs.finish(state, predicted, contacts, count, rounds, is_changed=is_changed)
+        asked = self._pairs.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
         if self._conclude is not None:
             self._conclude(self._pairs.outcome)
             self._velocities = box_of(state.velocity, 0, state.vertex_count, self._ends)
-        return asked
+        return asked()
 
 
-class Turns:
-    """Turns that springs take after contacts have pushed, in a substep; none if it is not derived from.
+class Turns(Protocol):
+    """Turns that springs take with contacts in a substep."""
 
-    Attributes:
-        taken: how many.
-        foreseen: how many more may be asked for before it is known whether they are needed.
-        decides: whether the device knows by itself if they go on.
-    """
+    def measure(self) -> None:
+        """Ask how long springs are."""
 
-    taken, foreseen, decides = 0, 0, False
-
-    def ask(self, *, ahead: int = 0) -> None:
-        """Have it found out whether springs have to take another turn; so many are `ahead` of those known as taken."""
-
-    def take(self, *, is_ahead: bool = False) -> None:
-        """Let springs change displacements; if it `is_ahead` of what is known, only where they have to."""
-
-    def go_on(self, *, pushes: bool) -> bool:  # noqa: ARG002  (for those that do)
-        """Whether they have to, as was found out last; if contacts push at all."""
-        return False
+    def relax(self) -> bool:
+        """Let springs change displacements where they were too long when measured; whether they did."""
 
 
 class ImpactZones:

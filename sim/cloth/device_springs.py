@@ -51,11 +51,11 @@ class DeviceSprings:
             the last group may have empty ones.
         in_segments: whether these are threads.
         host: the springs on the host.
-        cloths: numbers of the cloths that they belong to.
+        cloths: numbers of the cloths that they belong to; `cloth_of` that of each, (count,).
     """
 
     def __init__(self, springs: Springs, cloth_of: NDArray[np.int32]) -> None:
-        self.host, self._cloth_of = springs, cloth_of
+        self.host, self.cloth_of = springs, cloth_of
         self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = springs.arity, len(springs)
         self.in_segments = springs.in_segments
@@ -83,12 +83,12 @@ class DeviceSprings:
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
         for number, cloth in enumerate(cloths):
-            own = self._cloth_of == number
+            own = self.cloth_of == number
             self.stiffness[own] = self.host.stiffness(cloth)[own]
             self.damping[own] = self.host.damping(cloth)[own]
         self.is_damped = bool((self.stiffness * self.damping).any())
         if self.in_segments:
-            self.poisson = np.array([cloth.poisson_ratio for cloth in cloths])[self._cloth_of]
+            self.poisson = np.array([cloth.poisson_ratio for cloth in cloths])[self.cloth_of]
             self._contraction.poisson.from_numpy(self.poisson.astype(np.float32))
             self.contracts = bool(self.poisson.any())
             self.on_device.shift.fill(0.0)
@@ -141,6 +141,12 @@ def measure_contraction(
         i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
         across = 0.5 * (contraction.strain[2 * i + other] + contraction.strain[2 * j + other])
         springs.shift[s] = contraction.poisson[s] * springs.law[s][0] * across
+
+
+@ti.func
+def offset_of(strain: ti.f32, ahead: ti.f32, shares: ti.math.vec2) -> ti.f32:
+    """By how much a strain is felt as less that velocities at the start of a step would make so much larger in it."""
+    return strain * (1.0 - 1.0 / shares[0]) + shares[1] / shares[0] * ahead
 
 
 @func

@@ -12,7 +12,6 @@ from sim.cloth.device_cells import DeviceCells, compute_cell_forces
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
 from sim.cloth.springs import longest_explicit_step
 from sim.cloth.state import ClothState
-from sim.cloth.threads import NO_TURN
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.launch import kernel
 
@@ -42,16 +41,10 @@ class ExplicitSprings:
         )
         self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
 
-    def take_parameters(self) -> None:
+    def take_parameters(self, resolved: NDArray[np.float64]) -> None:
         """Springs hold their own stiffness."""
 
-    turns_taken = 0  # they take none, as contacts do not change what they are
-
-    def foresees(self, cloths: NDArray[np.bool_]) -> bool:  # noqa: ARG002  (the integrators' protocol)
-        """Nothing is to be foreseen."""
-        return False
-
-    def excess(self, dt: float, turn: int = NO_TURN) -> Callable[[], NDArray[np.float64]]:  # noqa: ARG002  (as above)
+    def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:  # noqa: ARG002  (the integrators' protocol)
         """None: springs are as long as their forces make them."""
         return lambda: np.zeros(len(self._state.names))
 
@@ -86,7 +79,7 @@ class ExplicitSprings:
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Displacements follow from velocities alone."""
 
-    def sweep(self, dt: float, cloths: NDArray[np.bool_], *, is_ahead: bool = False) -> None:
+    def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
         """Nor do they follow contacts."""
 
 

@@ -8,7 +8,6 @@ from sim.cloth.bundles import (
     Counters,
     EdgeBlocks,
     Four,
-    PairLists,
     PairPieces,
     PatchBlocks,
     PatchPairArrays,
@@ -39,8 +38,8 @@ END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
 LANES, LANES_OF_PIECE, EDGE_PARTS, VERTEX_PARTS = 32, 8, 2, 4
-"""Threads of a GPU for a pair of patches, one for each edge or so, and for a piece of a list; how many times as many
-search for edges, one for each block that an edge is compared with; and how many of the threads share a vertex, of which
+"""Threads of a GPU for a pair of patches, one for each edge or so, and those that look at a piece; how many times as
+many search for one, as one for each block that an edge is compared with; and how many of these share a vertex, of which
 a patch has a third as many as edges: each has a part of the block of triangles that it is compared with."""
 
 
@@ -134,13 +133,13 @@ def pair_vertices_with_triangles(
                             c = surface.position[corners[2]] - x
                             apart = distance_to_triangle(ti.math.vec3(0.0), a, b, c)
                             if apart < met.reach[p]:
-                                slot = ti.atomic_add(found.pieces[p][2], 1)
-                                if slot < found.pieces[p][1]:
-                                    there = found.pieces[p][0] + slot
+                                slot = ti.atomic_add(found.pieces[2 * p][2], 1)
+                                if slot < found.pieces[2 * p][1]:
+                                    there = found.pieces[2 * p][0] + slot
                                     found.pairs[there] = Four(v, corners[0], corners[1], corners[2])
                                     found.wanted[there], found.due[there] = UNKNOWN, met.slack[p] - apart
                                     soonest = ti.max(soonest, met.slack[p] - apart)
-    raise_to(found.piece_due, p, soonest, thread, WARP)
+    raise_to(found.piece_due, 2 * p, soonest, thread, WARP)
 
 
 @func
@@ -200,40 +199,51 @@ def pair_edges(
                         far_half = ti.math.vec3(blocks.half_x[there], blocks.half_y[there], blocks.half_z[there])
                         apart = distance_of_edges(-half, half, between - far_half, between + far_half)
                         if apart < met.reach[p]:
-                            slot = ti.atomic_add(found.pieces[p][2], 1)
-                            if slot < found.pieces[p][1]:
-                                place_of_pair = found.pieces[p][0] + slot
+                            slot = ti.atomic_add(found.pieces[2 * p + 1][2], 1)
+                            if slot < found.pieces[2 * p + 1][1]:
+                                place_of_pair = found.pieces[2 * p + 1][0] + slot
                                 # In this order, so that rounding does not depend on that of the patches.
                                 found.pairs[place_of_pair] = ti.select(
                                     f[0] < e[0], Four(f[0], f[1], e[0], e[1]), Four(e[0], e[1], f[0], f[1])
                                 )
                                 found.wanted[place_of_pair], found.due[place_of_pair] = UNKNOWN, met.slack[p] - apart
                                 soonest = ti.max(soonest, met.slack[p] - apart)
-    raise_to(found.piece_due, p, soonest, lane, WARP)
+    raise_to(found.piece_due, 2 * p + 1, soonest, lane, WARP)
 
 
 @func
-def lengthen(p: ti.i32, listed: PairPieces, ends: Integers, number: ti.template()):
-    """Move a piece to the end of its list, empty, if more was found than it has room for; it is searched `again`."""
-    found = listed.pieces[p][2]
-    if found > listed.pieces[p][1]:
+def search_piece(
+    piece: ti.i32,
+    thread: ti.i32,
+    met: PatchPairArrays,
+    boxes: Boxes,
+    surface: Surface,
+    blocks: PatchBlocks,
+    found: PairPieces,
+):
+    """List what one piece of a pair of patches has, as one of several threads."""
+    lanes, parts, of_vertex = ti.static((on_gpu(LANES), on_gpu(EDGE_PARTS), on_gpu(VERTEX_PARTS)))
+    if piece % 2 == 0:
+        pair_vertices_with_triangles(piece // 2, thread, lanes * parts, of_vertex, met, boxes, surface, blocks, found)
+    else:
+        pair_edges(piece // 2, thread, lanes, parts, met, boxes, blocks.edges, found)
+
+
+@func
+def lengthen(piece: ti.i32, listed: PairPieces):
+    """Move a piece to the end of the list, empty, if more was found than it has room for; it is searched `again`."""
+    found = listed.pieces[piece][2]
+    if found > listed.pieces[piece][1]:
         places = found + found // 2
-        listed.pieces[p] = Four(ti.atomic_add(ends[number], places), places, 0, 0)
-        listed.again[ti.atomic_add(ends[2 + number], 1)] = p
+        listed.pieces[piece] = Four(ti.atomic_add(listed.ends[0], places), places, 0, 0)
+        listed.again[ti.atomic_add(listed.ends[1], 1)] = piece
 
 
 @kernel
 def carry_pieces(
-    count: ti.i32,
-    workers: ti.i32,
-    taken: Integers,
-    carried: Integers,
-    before: PairPieces,
-    now: PairPieces,
-    ends: Integers,
-    number: ti.i32,
-) -> ti.i32:
-    """Pieces of the pairs of patches that were listed before, at the places of their numbers now; returns the end.
+    count: ti.i32, workers: ti.i32, taken: Integers, carried: Integers, before: PairPieces, now: PairPieces
+):
+    """So many pieces of pairs of patches that were listed before, at the places of their numbers now.
 
     Those that have any elements are listed in `again` meanwhile, as most have none.
 
@@ -241,30 +251,31 @@ def carry_pieces(
         carried: numbers that pairs of patches had before, or -1.
     """
     lanes = ti.static(on_gpu(LANES))
-    ends[number], ends[2 + number] = 0, 0
-    for p in range(count):
-        now.pieces[p], now.piece_due[p] = Four(0), NEVER
-        if carried[p] >= 0 and before.pieces[carried[p]][2] > 0:
-            found = before.pieces[carried[p]][2]
-            now.pieces[p] = Four(ti.atomic_add(ends[number], found), found, found, 0)
-            now.piece_due[p] = before.piece_due[carried[p]]
-            now.again[ti.atomic_add(ends[2 + number], 1)] = p
-    moved, moving = ends[2 + number], workers
+    now.ends[0], now.ends[1] = 0, 0
+    for piece in range(count):
+        now.pieces[piece], now.piece_due[piece] = Four(0), NEVER
+        old = 2 * carried[piece // 2] + piece % 2
+        if old >= 0 and before.pieces[old][2] > 0:
+            found = before.pieces[old][2]
+            now.pieces[piece] = Four(ti.atomic_add(now.ends[0], found), found, found, 0)
+            now.piece_due[piece] = before.piece_due[old]
+            now.again[ti.atomic_add(now.ends[1], 1)] = piece
+    moved, moving = now.ends[1], workers
     if ti.static(runs_on_gpu()):
         moving = moved * lanes
     begin_sharing(taken, 0)
     for worker in range(moving):
         item = next_item(-1, worker, taken, 0, CARRIED_AT_A_TIME)
         while item < moved * lanes:
-            p = now.again[item // lanes]
-            first, start, k = before.pieces[carried[p]][0], now.pieces[p][0], item % lanes
-            while k < now.pieces[p][2]:
+            piece = now.again[item // lanes]
+            first, start = before.pieces[2 * carried[piece // 2] + piece % 2][0], now.pieces[piece][0]
+            k = item % lanes
+            while k < now.pieces[piece][2]:
                 now.pairs[start + k] = before.pairs[first + k]
                 now.wanted[start + k], now.due[start + k] = before.wanted[first + k], before.due[first + k]
                 k += lanes
             item = next_item(item, worker, taken, 0, CARRIED_AT_A_TIME)
-    ends[2 + number] = 0
-    return ends[number]
+    now.ends[1] = 0
 
 
 @kernel
@@ -290,16 +301,17 @@ def look_at_piece(
     """Look at the pairs of elements of one pair of patches that are due, as one of several threads; or at none, as
     `NO_MORE` of them.
     """
+    piece = 2 * both + ti.cast(are_edges, ti.i32)
     soonest, is_left = NEVER, met.left[both]
-    place, end = lane, listed.pieces[both][2]
-    first = listed.pieces[both][0]
+    place, end = lane, listed.pieces[piece][2]
+    first = listed.pieces[piece][0]
     while place < end:
         p = first + place
         if listed.due[p] >= is_left:
             listed.due[p] = look_at_pair(p, both, listed, met, are_edges, surface, rest, recovery, contacts)
         soonest = ti.max(soonest, listed.due[p])
         place += lanes
-    raise_to(listed.piece_due, both, soonest, lane, lanes)
+    raise_to(listed.piece_due, piece, soonest, lane, lanes)
 
 
 @func
@@ -419,12 +431,12 @@ def enclose_elements(
 
 @large_kernel
 def find_near_pairs(
-    numbers: ti.math.ivec4,
+    numbers: ti.math.ivec3,
     counters: Counters,
     met: PatchPairArrays,
     boxes: Boxes,
     blocks: PatchBlocks,
-    lists: PairLists,
+    listed: PairPieces,
     surface: Surface,
     rest: Rest,
     recovery: ti.f32,
@@ -434,8 +446,8 @@ def find_near_pairs(
     triangles of the other within `reach` [m] of them, and the edges of both within that of each other. Then append the
     listed pairs that are nearer than they shall be, or get there, and those that might cross.
 
-    Pieces that are too short for what is found move to the end of their list, and are searched again. If a list is too
-    short for that, nothing else is done: once it is longer, a call that searches no pairs goes on from there.
+    Pieces that are too short for what is found move to the end of the list, and are searched again. If that is too
+    short, nothing else is done: once it is longer, a call that searches no pairs goes on from there.
 
     Of contacts, the displacement along the line of shortest distance counts. A pair might cross when its vertices,
     displaced as they are now and by contacts besides, come together: then it is watched, `INACTIVE`. They come no
@@ -444,80 +456,65 @@ def find_near_pairs(
     looked at.
 
     Args:
-        numbers: whether to search, not if that is done, and only room was missing; most pairs of elements of both
-            lists; workers (`sim.core.scheduling`) of a CPU's loops that have anything to do.
+        numbers: whether to search, not if that is done, and only room was missing; most pairs of elements; workers
+            (`sim.core.scheduling`) of a CPU's loops that have anything to do.
         counters: how many pairs of patches are expired, and due, and whether the list of them does not hold: then
             nothing is done.
         met, boxes: all pairs of patches, of which `needed` is 0 after; where patches are.
         blocks: elements of the patches.
-        lists: of vertices with triangles, and of edges; `again` gets the numbers of pieces that were too short.
+        listed: pairs of elements; `again` gets the numbers of pieces that were too short.
         surface, rest: all nodes.
         recovery: share of a missing distance that the substep gives back [-].
-        contacts: the list; its second and third number become the ends that both lists need.
+        contacts: the list; the second number of its counter becomes the end that `listed` needs.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     lanes, of_piece = ti.static(on_gpu(LANES), on_gpu(LANES_OF_PIECE))
-    parts, of_vertex = ti.static(on_gpu(EDGE_PARTS), on_gpu(VERTEX_PARTS))
-    threads = ti.static(lanes * (1 + parts))
+    threads = ti.static(lanes * on_gpu(EDGE_PARTS))
     holds = ti.cast(counters.found[2] == 0, ti.i32)
-    count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[3]
+    count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[2]
     enclosing = searching = ti.min(count, 1) * workers
     due_end = whole_warps(due_count * of_piece)  # then those of edges, in warps of their own
     looking = ti.min(due_count, 1) * workers
     if ti.static(runs_on_gpu()):
-        enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), count * threads
+        enclosing, searching = ti.min(count, 1) * (blocks.vertices.count * lanes + count), 2 * count * threads
         looking = 2 * due_end
     if count > 0:
-        lists.ends[2], lists.ends[3] = 0, 0
+        listed.ends[1] = 0
     begin_sharing(counters.taken, 0)
     for worker in range(enclosing):
         item = next_item(-1, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
         while item < blocks.vertices.count * lanes + count:
             if item >= blocks.vertices.count * lanes:
                 p = met.expired[item - blocks.vertices.count * lanes]
-                lists.triangles.pieces[p][2], lists.edges.pieces[p][2] = 0, 0
+                listed.pieces[2 * p][2], listed.pieces[2 * p + 1][2] = 0, 0
             elif met.needed[item // lanes] == 1:
                 enclose_elements(item // lanes, item % lanes, lanes, surface.position, blocks.edges, blocks.triangles)
             item = next_item(item, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
     begin_sharing(counters.taken, 1)
     for worker in range(searching):
         item = next_item(-1, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
-        while item < count * threads:
-            thread = item - count * lanes
-            if thread < 0:
-                p = met.expired[item // lanes]
-                pair_vertices_with_triangles(
-                    p, item % lanes, lanes, of_vertex, met, boxes, surface, blocks, lists.triangles
-                )
-            else:
-                p = met.expired[thread // (lanes * parts)]
-                pair_edges(p, thread % (lanes * parts), lanes, parts, met, boxes, blocks.edges, lists.edges)
+        while item < 2 * count * threads:
+            of_all = item // threads  # first vertices with triangles of all
+            piece = 2 * met.expired[of_all % count] + of_all // count
+            search_piece(piece, item % threads, met, boxes, surface, blocks, listed)
             item = next_item(item, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for k in range(count):
-        pair = met.pairs[met.expired[k]]
-        met.needed[pair[0]], met.needed[pair[1]] = 0, 0
-        lengthen(met.expired[k], lists.triangles, lists.ends, 0)
-        lengthen(met.expired[k], lists.edges, lists.ends, 1)
-    fits = ti.cast(lists.ends[0] <= numbers[1] and lists.ends[1] <= numbers[2], ti.i32)
-    short, short_edges = fits * lists.ends[2], fits * lists.ends[3]
-    searching_again, looking_now = ti.min(short + short_edges, 1) * workers, fits * looking
+        p = met.expired[k]
+        met.needed[met.pairs[p][0]], met.needed[met.pairs[p][1]] = 0, 0
+        lengthen(2 * p, listed)
+        lengthen(2 * p + 1, listed)
+    fits = ti.cast(listed.ends[0] <= numbers[1], ti.i32)
+    short = fits * listed.ends[1]
+    searching_again, looking_now = ti.min(short, 1) * workers, fits * looking
     if ti.static(runs_on_gpu()):
-        searching_again = short * lanes + short_edges * lanes * parts
+        searching_again = short * threads
     begin_sharing(counters.taken, 2)
     for worker in range(searching_again):
         item = next_item(-1, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
-        while item < short * lanes + short_edges * lanes * parts:
-            thread = item - short * lanes
-            if thread < 0:
-                p = lists.triangles.again[item // lanes]
-                pair_vertices_with_triangles(
-                    p, item % lanes, lanes, of_vertex, met, boxes, surface, blocks, lists.triangles
-                )
-            else:
-                p = lists.edges.again[thread // (lanes * parts)]
-                pair_edges(p, thread % (lanes * parts), lanes, parts, met, boxes, blocks.edges, lists.edges)
+        while item < short * threads:
+            search_piece(listed.again[item // threads], item % threads, met, boxes, surface, blocks, listed)
             item = next_item(item, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
     begin_sharing(counters.taken, 3)
     for worker in range(looking_now):
@@ -527,9 +524,9 @@ def find_near_pairs(
             lane = ti.select(place < due_count, item % of_piece, NO_MORE)
             p = met.due[ti.min(place, due_count - 1)]
             if item < due_end:
-                look_at_piece(p, lane, of_piece, lists.triangles, met, False, surface, rest, recovery, contacts)
+                look_at_piece(p, lane, of_piece, listed, met, False, surface, rest, recovery, contacts)
             else:
-                look_at_piece(p, lane, of_piece, lists.edges, met, True, surface, rest, recovery, contacts)
+                look_at_piece(p, lane, of_piece, listed, met, True, surface, rest, recovery, contacts)
             item = next_item(item, worker, counters.taken, 3, DUE_AT_A_TIME)
-    lists.ends[2], lists.ends[3] = lists.ends[2] - short, lists.ends[3] - short_edges
-    contacts.counter[1], contacts.counter[2], contacts.counter[4] = lists.ends[0], lists.ends[1], holds * fits
+    listed.ends[1] = listed.ends[1] - short
+    contacts.counter[1], contacts.counter[3] = listed.ends[0], holds * fits

@@ -23,7 +23,6 @@ from sim.cloth.bundles import (
 from sim.cloth.contact_response import thickness_between
 from sim.cloth.near_pairs import NEVER, SAFETY_OF_DUE
 from sim.cloth.proximity_contacts import EDGE_EDGE
-from sim.cloth.state import OVER, OVER_WITH_MORE
 from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
@@ -370,9 +369,9 @@ def age_pair(
                 met.needed[m], met.needed[other] = 1, 1
         if met.wake[p] < 0.0:
             met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
-            if is_searched or ageing.first_due[p] >= met.left[p] or ageing.first_due_of_edges[p] >= met.left[p]:
+            if is_searched or ti.max(ageing.first_due[2 * p], ageing.first_due[2 * p + 1]) >= met.left[p]:
                 met.due[ti.atomic_add(counter[1], 1)] = p
-                ageing.first_due[p], ageing.first_due_of_edges[p] = NEVER, NEVER
+                ageing.first_due[2 * p], ageing.first_due[2 * p + 1] = NEVER, NEVER
 
 
 @func
@@ -414,33 +413,21 @@ def margin_after(is_changed: ti.i32, change: ti.f32, margin: ti.f32, least: ti.f
 
 
 @func
-def finish_patch(m: ti.i32, nodes: TrackedNodes, patches: MovingPatches, end: SubstepEnd):
-    """What a patch used up of the lists in a substep, and its margin for the next one. If contacts changed it by more
-    than `negligible` [m] it is fitted anew.
-    """
+def finish_patch(m: ti.i32, patches: MovingPatches, end: SubstepEnd):
+    """What a patch used up of the lists in a substep, and its margin for the next one."""
     (budget,) = ti.static((patches.budget,))
     margin, change = budget.margin[m], ti.select(end.is_changed == 1, budget.change[m], 0.0)
     budget.change[m] = change
     budget.spent[m] += budget.moves[m] + change + end.astray
     budget.margin[m] = margin_after(end.is_changed, change, margin, end.least_margin)
     budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
-    if change > end.negligible:
-        fit_motion(m, end.still, patches.corners, nodes, patches.bounds)
 
 
 @func
-def finish_pair(p: ti.i32, met: PatchPairArrays, patches: MovingPatches, negligible: ti.f32):
+def finish_pair(p: ti.i32, met: PatchPairArrays, budget: PatchBudget):
     """The same of a pair of patches."""
-    (budget,) = ti.static((patches.budget,))
     if met.slack[p] > 0.0:
-        m, other = met.pairs[p][0], met.pairs[p][1]
-        nearer = met.approach[p] + budget.change[m] + budget.change[other]
-        if ti.max(budget.change[m], budget.change[other]) > negligible:
-            nearer = approach_of(m, other, patches.bounds.motion)
-            # A patch that was not fitted anew moves as noted, but for its change.
-            nearer += ti.select(budget.change[m] > negligible, 0.0, budget.change[m])
-            nearer += ti.select(budget.change[other] > negligible, 0.0, budget.change[other])
-        met.slack[p] -= nearer
+        met.slack[p] -= met.approach[p] + budget.change[met.pairs[p][0]] + budget.change[met.pairs[p][1]]
 
 
 LARGEST_SHARE = 0.9
@@ -523,8 +510,8 @@ def end_contacts(
     workers: ti.math.ivec3,
     counters: Counters,
 ) -> ti.math.ivec3:
-    """Test `count` contacts at most (`repair_crossing`); if none failed, measure how far they displaced patches; if not
-    farther than allowed for, displacements are final: note where they lead, and what of the lists they use up.
+    """Test `count` contacts (`repair_crossing`); if none failed, measure how far they displaced patches; if not farther
+    than allowed for, displacements are final: note where they lead, and what of the lists they use up.
 
     Args:
         count, contacts, tested: see `repair_crossing`.
@@ -535,16 +522,12 @@ def end_contacts(
         counters: three numbers.
 
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
-    is not finite. Nothing is done, and farther is said, if the end `is_ahead` of rounds that are not over, of steps
-    that they lack, or of contacts that have no room.
+    is not finite.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    is_enough = end.rounds[0] == OVER and (end.counter[0] == 0 or end.counter[3] == 0)
-    is_over = (is_enough or end.rounds[0] == OVER_WITH_MORE) and contacts.counter[3] > 0
-    ends = ti.cast(end.is_ahead == 0 or is_over, ti.i32)
-    contacts_end, vertices_end = ends * ti.min(count, contacts.counter[3]), ends * vertex_count
-    displaced_end, patches_end, pairs_end = ends * workers[0], ends * workers[1], ends * workers[2]
-    counters.found[0], counters.found[1], counters.found[2] = 0, 1 - ends, 0
+    contacts_end, vertices_end = count, vertex_count
+    displaced_end, patches_end, pairs_end = workers[0], workers[1], workers[2]
+    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
     for c in range(contacts_end):
         repair_crossing(c, contacts, tested, nodes, counters.found)
     begin_sharing(counters.taken, 0)
@@ -562,13 +545,13 @@ def end_contacts(
         stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, patches.corners.count, 0)
         m = next_item(-1, worker, counters.taken, 1, PATCHES_AT_A_TIME)
         while m < stop:
-            finish_patch(m, nodes, patches, end)
+            finish_patch(m, patches, end)
             m = next_item(m, worker, counters.taken, 1, PATCHES_AT_A_TIME)
     begin_sharing(counters.taken, 2)
     for worker in range(pairs_end):
         stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, met.count, 0)
         p = next_item(-1, worker, counters.taken, 2, PAIRS_AT_A_TIME)
         while p < stop:
-            finish_pair(p, met, patches, end.negligible)
+            finish_pair(p, met, patches.budget)
             p = next_item(p, worker, counters.taken, 2, PAIRS_AT_A_TIME)
     return ti.math.ivec3(counters.found[0], counters.found[1], counters.found[2])

@@ -65,7 +65,7 @@ TOO_MANY = f"more than {MAX_PAIRS} pairs of cloth elements are near each other; 
 
 
 class PairList:
-    """Pairs of elements, those of each pair of patches in a piece of its own; grows when it must.
+    """Pairs of elements, those of each pair of patches in pieces of their own; grows when it must.
 
     Attributes:
         on_device: the list for kernels.
@@ -73,43 +73,47 @@ class PairList:
 
     Args:
         capacity: pairs of elements to start with.
-        pieces: pairs of patches.
-        ends: of all lists, on the device.
-        number: of this one.
+        met: pairs of patches.
     """
 
-    def __init__(self, *, capacity: int, pieces: int, ends: ti.Ndarray, number: int) -> None:
-        self._ends, self._number = ends, number
-        self._taken = ti.ndarray(ti.i32, 1)
+    def __init__(self, *, capacity: int, met: int) -> None:
+        self._ends, self._taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 1)
         self.capacity = capacity
-        self.on_device = PairPieces(*_room_for_pieces(pieces), *_room_for_pairs(capacity))
-        self._spare = PairPieces(*_room_for_pieces(pieces), *_room_for_pairs(1))
+        self.on_device = PairPieces(*self._room_for_pieces(met), *_room_for_pairs(capacity))
+        self._spare = PairPieces(*self._room_for_pieces(met), *_room_for_pairs(1))
 
-    def set_pieces(self, capacity: int) -> None:
+    def _room_for_pieces(self, met: int) -> tuple[ti.Ndarray, ...]:
+        """The first `OF_PIECES` arrays for so many pairs of patches, of which nothing is listed."""
+        piece_due = ti.ndarray(ti.f32, 2 * met)
+        piece_due.fill(NEVER)
+        return ti.ndarray(Four, 2 * met), piece_due, ti.ndarray(ti.i32, 2 * met), self._ends
+
+    def set_pieces(self, met: int) -> None:
         """Make room for the pieces of so many pairs of patches, all empty."""
         self._ends.fill(0)
-        self.on_device = PairPieces(*_room_for_pieces(capacity), *self.on_device[OF_PIECES:])
-        self._spare = PairPieces(*_room_for_pieces(capacity), *self._spare[OF_PIECES:])
+        self.on_device = PairPieces(*self._room_for_pieces(met), *self.on_device[OF_PIECES:])
+        self._spare = PairPieces(*self._room_for_pieces(met), *self._spare[OF_PIECES:])
 
-    def carry(self, count: int, carried: ti.Ndarray, capacity: int) -> None:
+    def carry(self, count: int, carried: ti.Ndarray, met: int) -> None:
         """Follow pairs of patches to their new numbers, with their pieces.
 
         Args:
             count: how many there are now.
             carried: their numbers before, or -1, (count,).
-            capacity: most of them.
+            met: most of them.
         """
         # Two sets of arrays in turn: new ones would have all launches prepared anew.
         before, now = self.on_device, self._spare
-        if now.pieces.shape[0] < capacity:
-            now = PairPieces(*_room_for_pieces(capacity), *now[OF_PIECES:])
+        if now.pieces.shape[0] < 2 * met:
+            now = PairPieces(*self._room_for_pieces(met), *now[OF_PIECES:])
         if now.pairs.shape[0] < self.capacity:
             now = PairPieces(*now[:OF_PIECES], *_room_for_pairs(self.capacity))
         self.on_device, self._spare = now, before
-        carry_pieces(count, workers_for(count), self._taken, carried, before, now, self._ends, self._number)
+        carry_pieces(2 * count, workers_for(count), self._taken, carried, before, now)
 
     def reach_to(self, end: int) -> bool:
-        """Whether pieces up to this place did not fit; now there is room, and what was listed is kept.
+        """Whether pieces up to this place did not fit, so that their search has to go on; now there is room, and what
+        was listed is kept.
 
         Raises:
             OverflowError: more pairs than any useful step has.
@@ -128,15 +132,8 @@ class PairList:
         keep_pairs(kept, before, self.on_device)
 
 
-OF_PIECES = 3
-"""How many of the arrays of `PairPieces`, the first ones, have a number of each piece; others have one of each pair."""
-
-
-def _room_for_pieces(capacity: int) -> tuple[ti.Ndarray, ...]:
-    """Pieces, all empty, when they are due, numbers of those that are searched again."""
-    piece_due = ti.ndarray(ti.f32, capacity)
-    piece_due.fill(NEVER)
-    return ti.ndarray(Four, capacity), piece_due, ti.ndarray(ti.i32, capacity)
+OF_PIECES = 4
+"""How many of the arrays of `PairPieces`, the first ones, are of pieces; others are of pairs."""
 
 
 def _room_for_pairs(capacity: int) -> tuple[ti.Ndarray, ...]:
@@ -154,8 +151,7 @@ class PatchPairs:
         bounds: boxes around patches at the last `look`, and the rigid motion of each in the substep.
         budget: how far they move, and may be displaced by contacts.
         carried: numbers that pairs had before the last `meet`, or -1, (count,).
-        counters: of `look_at_patches`.
-        outcome: what the last `finish` answers, on the device.
+        counters: of `look_at_patches` and `end_contacts`.
         expired_count, due_count: how many pairs have to be searched, and have elements that have to be looked at.
 
     Args:
@@ -172,7 +168,6 @@ class PatchPairs:
         self._tree: BoxTree = with_room(BoxTree, 2 * patches.leaves, leaves=patches.leaves)
         self._moving = MovingPatches(patches.corner_lists, self.bounds, self.budget)
         self.counters: Counters = with_room(Counters, 3)
-        self.outcome = ti.ndarray(ti.i32, 3)
         self._first_known = ti.ndarray(ti.i32, 2 * max(m, 1))
         self._maxima = LaneReduction(maxima=7, sums=0)
         self._astray, self._half_thickness, self._still, self._fits = 0.0, 0.0, 0.0, True
@@ -279,7 +274,7 @@ class PatchPairs:
 
         Args:
             state: at the start of the substep.
-            ageing: how; `PairPieces.piece_due` of both lists is `NEVER` after this where a pair is due.
+            ageing: how; `PairPieces.piece_due` is `NEVER` after this where a pair is due.
         """
         self._look(state, 0, ageing)()
         return self.expired_count
@@ -296,7 +291,7 @@ class PatchPairs:
             self._still,
             self._moving,
             self.on_device,
-            ageing or Ageing(0.0, 0.0, self.on_device.left, self.on_device.left),
+            ageing or Ageing(0.0, 0.0, self.on_device.left),
             (workers_for(patches.count) if looks_at_patches else 0, workers_for(self.count) if ageing else 0),
             self.counters,
         )
@@ -316,8 +311,6 @@ class PatchPairs:
         predicted: ti.Ndarray,
         contacts: ContactList,
         count: int,
-        negligible: float,
-        rounds: tuple[int, ti.Ndarray, ti.Ndarray],
         *,
         is_changed: bool,
     ) -> Callable[[], list[int]]:
@@ -330,9 +323,7 @@ class PatchPairs:
             state: at the end of its displacements.
             predicted: displacements as contacts were looked for.
             contacts: in the substep.
-            count: of those that are tested, at most.
-            negligible: what contacts may add without the motion of patches being looked at anew [m].
-            rounds: the first three of `SubstepEnd`.
+            count: of those that are tested.
             is_changed: whether contacts changed displacements.
         """
         patches, half = self.patches, self._half_thickness
@@ -344,8 +335,8 @@ class PatchPairs:
             self._tracked(state),
             predicted,
             self._moving,
-            SubstepEnd(*rounds, int(is_changed), self._astray, self._still, negligible, MARGIN * 2.0 * half, half),
+            SubstepEnd(int(is_changed), self._astray, MARGIN * 2.0 * half, half),
             self.on_device,
             (is_changed * workers_for(patches.count), workers_for(patches.count), workers_for(self.count)),
-            Counters(self.counters.taken, self.outcome),
+            self.counters,
         )

@@ -10,7 +10,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import EdgeBlocks, PatchBlocks, PatchElements, PatchNodes, TriangleBlocks
+from sim.cloth.bundles import EdgeBlocks, PatchBlocks, PatchLists, PatchNodes, TriangleBlocks
 from sim.cloth.state import HostCloths
 from sim.core.arrays import on_device
 from sim.core.reductions import runs_on_gpu
@@ -39,7 +39,7 @@ class Patches:
         first_triangle, first_edge, first_vertex: of each patch, (m + 1,).
         triangles: in the order of the patches, (k,) ivec3 of vertices; edges (e,) ivec2; vertices (n,).
         first_corner, corners: all vertices of a patch's triangles, which its edges end at, its own and others, (c,).
-        corner_lists, vertex_lists, elements: these for kernels.
+        corner_lists, vertex_lists, lists: these for kernels.
         cloth: of each patch, (m,).
 
     Args:
@@ -72,7 +72,8 @@ class Patches:
         self.cloth = on_device(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
         self.corner_lists = PatchNodes(self.count, self.first_corner, self.corners)
         self.vertex_lists = PatchNodes(self.count, self.first_vertex, self.vertices)
-        self.elements = PatchElements(self.count, self.first_edge, self.edges, self.first_triangle, self.triangles)
+        elements = self.first_edge, self.edges, self.first_triangle, self.triangles
+        self.lists = PatchLists(self.vertex_lists, *elements)
 
 
 def _patch_of_triangles(host: HostCloths) -> NDArray[np.int64]:

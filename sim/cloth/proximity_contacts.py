@@ -24,21 +24,21 @@ class ContactList:
     Attributes:
         capacity: there is room for so many.
         found: what finding contacts writes; its `counter` has how many were found, also those beyond the capacity; the
-            ends that lists of pairs need; how many may push, 0 if what was found is not all; and whether it is all of
-            cloth with cloth.
+            end that the list of pairs needs; how many may push, 0 if what was found is not all; and whether it is all
+            of cloth with cloth.
         crossing: whether pairs may have crossed, (capacity,).
     """
 
     def __init__(self, capacity: int, *, drifts: bool = False) -> None:
         """Room for so many; `drifts` where some are with bodies that deform."""
         self._drifts = drifts
-        self._counter = ti.ndarray(ti.i32, 5)
+        self._counter = ti.ndarray(ti.i32, 4)
         self.forget()
         self._allocate(capacity)
 
     def forget(self) -> None:
         """Nothing is found."""
-        self._counter.from_numpy(np.array([0, 0, 0, 0, 1], dtype=np.int32))
+        self._counter.from_numpy(np.array([0, 0, 0, 1], dtype=np.int32))
 
     def make_room_for(self, found: int) -> bool:
         """Whether so many contacts did not fit, so that they have to be found again; now there is room."""

@@ -307,7 +307,7 @@ class RigidContact:
         is_alone, shows = not (self._walls.count or self.bodies.count), self._shows.any()
         lanes = on_gpu(LANES if shows else LANES_OF_VERTICES)
         return find_rigid_contacts.later(
-            PatchLists(patches.vertex_lists, patches.elements),
+            patches.lists,
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
             self._taken,
             motion,
@@ -507,15 +507,15 @@ def find_rigid_contacts(
     largest_half: ti.f32,
     near: Touching,
     meets: ti.template(),
-) -> ti.math.ivec3:
+) -> ti.math.ivec2:
     """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if cloth `meets` bodies,
     also with these, and if some show between vertices, those of triangles, each at its deepest point.
 
     Parallel however few there are: compiled twice, normals would be rounded differently. `work` has the threads that
-    share a patch, and workers (`sim.core.scheduling`). Returns the numbers of the list's counter, whose first is 0
-    then.
+    share a patch, and workers (`sim.core.scheduling`). Returns the first two numbers of the list's counter, of which
+    one is 0 then.
     """
-    vertices, elements, surface, contacts = ti.static((patches.vertices, patches.elements, near.surface, near.contacts))
+    vertices, surface, contacts = ti.static((patches.vertices, near.surface, near.contacts))
     walls, bodies = ti.static((near.walls, near.bodies))
     lanes, workers_end = work[0], work[1]
     begin_sharing(taken, 0)
@@ -543,24 +543,24 @@ def find_rigid_contacts(
                     place += lanes
                 if ti.static(meets == SHOWN_BODIES):
                     # One loop over edges, then triangles: what it does is compiled once, which takes seconds.
-                    edges = elements.first_edge[m + 1] - elements.first_edge[m]
-                    end = edges + elements.first_triangle[m + 1] - elements.first_triangle[m]
+                    edges = patches.first_edge[m + 1] - patches.first_edge[m]
+                    end = edges + patches.first_triangle[m + 1] - patches.first_triangle[m]
                     place = ti.select(is_near, item % lanes, end)
                     while place < end:
                         corners = Three(0)
                         if place < edges:
-                            ends = elements.edges[elements.first_edge[m] + place]
+                            ends = patches.edges[patches.first_edge[m] + place]
                             corners = Three(ends[0], ends[1], ends[1])
                         else:
-                            corners = elements.triangles[elements.first_triangle[m] + place - edges]
+                            corners = patches.triangles[patches.first_triangle[m] + place - edges]
                         for b in range(bodies.count):
                             passes = bodies.passes[near.cloth[corners[0]] * bodies.count + b] == 1
                             if bodies.shows[b] > ti.cast(place < edges, ti.i32) and not passes:
                                 touch_triangle(b, corners, allowed, near)
                         place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
-    found = ti.math.ivec3(contacts.counter[0], contacts.counter[1], contacts.counter[2])
-    contacts.counter[3] = ti.select(contacts.counter[4] == 1 and found[0] <= contacts.capacity, found[0], 0)
+    found = ti.math.ivec2(contacts.counter[0], contacts.counter[1])
+    contacts.counter[2] = ti.select(contacts.counter[3] == 1 and found[0] <= contacts.capacity, found[0], 0)
     contacts.counter[0] = 0
     return found
 

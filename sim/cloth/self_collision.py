@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Ageing, Boxes, Counters, PairLists, Rest
+from sim.cloth.bundles import Ageing, Boxes, Counters, Rest
 from sim.cloth.near_pairs import find_near_pairs, range_of_vectors
 from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches, blocks_of
@@ -30,9 +30,6 @@ LEAST_SKIN_IN_EDGES = 0.15
 """How far lists of pairs reach, and at least farther than the thickness, in mean edges, if motion does not ask for
 more: to last for many substeps at rest, but not list most neighbours in flat cloth, 0.9 mean edges and more off."""
 
-NEGLIGIBLE = 0.01
-"""Part of the thickness that contacts may add to the motion of a substep without it being looked at anew."""
-
 
 class SelfCollision:
     """Finds the pairs of cloth elements, of one cloth or several, that are near each other.
@@ -46,7 +43,7 @@ class SelfCollision:
     Attributes:
         patches: of the cloths.
         patch_pairs: which of them may meet, where they are, and how they move.
-        with_triangles, of_edges: the listed pairs.
+        listed: pairs of elements.
         thickness: the largest [m].
         mean_edge: at rest, of all cloths together [m]; how far lists reach.
         coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart. `longest_edge` of all.
@@ -64,11 +61,9 @@ class SelfCollision:
         self._rest = Rest(state.body, on_device(state.host.position))
         self._blocks = blocks_of(self.patches)
         self._collides = ti.ndarray(ti.i32, len(state.names))
-        self._ends, self._taken = ti.ndarray(ti.i32, 4), ti.ndarray(ti.i32, 4)
-        self.with_triangles, self.of_edges = (
-            PairList(capacity=capacity, pieces=self.patch_pairs.capacity, ends=self._ends, number=number)
-            for number, capacity in enumerate((state.vertex_count, len(state.host.edges.nodes)))
-        )
+        self._taken = ti.ndarray(ti.i32, 4)
+        elements = state.vertex_count + len(state.host.edges.nodes)
+        self.listed = PairList(capacity=elements, met=self.patch_pairs.capacity)
         edges = state.host.position[state.host.edges.nodes]
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
         self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
@@ -129,31 +124,23 @@ class SelfCollision:
         """How pairs of patches are aged."""
         edge = self.mean_edge
         least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        due, due_edges = (pairs.on_device.piece_due for pairs in (self.with_triangles, self.of_edges))
-        return Ageing(self.thickness, least_skin, due, due_edges)
+        return Ageing(self.thickness, least_skin, self.listed.on_device.piece_due)
 
     def warm_up(self) -> None:
         """Compile what carries lists over, and what makes room in them."""
-        self.with_triangles.carry(0, self.patch_pairs.carried, self.patch_pairs.capacity)
-        self.with_triangles.resize(self.with_triangles.capacity)
+        self.listed.carry(0, self.patch_pairs.carried, self.patch_pairs.capacity)
+        self.listed.resize(self.listed.capacity)
 
     def finish(
-        self,
-        state: ClothState,
-        predicted: ti.Ndarray,
-        contacts: ContactList,
-        count: int,
-        rounds: tuple[int, ti.Ndarray, ti.Ndarray],
-        *,
-        is_changed: bool,
+        self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
     ) -> Callable[[], list[int]]:
         """See `PatchPairs.finish`."""
         if not (self.meets or is_changed or self._was_changed):
             self.outcome = self._nothing
             return lambda: [0, 0, 0]
-        self.outcome = self.patch_pairs.outcome
-        self._was_changed, negligible = is_changed, NEGLIGIBLE * self.thickness
-        return self.patch_pairs.finish(state, predicted, contacts, count, negligible, rounds, is_changed=is_changed)
+        self.outcome = self.patch_pairs.counters.found
+        self._was_changed = is_changed
+        return self.patch_pairs.finish(state, predicted, contacts, count, is_changed=is_changed)
 
     def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.
@@ -168,45 +155,35 @@ class SelfCollision:
             recovery: share of a missing distance that the substep gives back [-].
             is_ahead: not to wait for what `look` has found; if pairs of patches do not hold, nothing is appended.
         """
-        met, lists = self.patch_pairs, (self.with_triangles, self.of_edges)
+        met, listed = self.patch_pairs, self.listed
         if not is_ahead or self._is_forgotten or self._is_outrun:
             self.looked()
         if not self.meets:
             return
         if self._is_forgotten or self._is_outrun:
             keeps = met.meet(self.thickness, self.mean_edge, self._collides, keeps=not self._is_forgotten)
-            for pairs in lists:
-                if keeps:
-                    pairs.carry(met.count, met.carried, met.capacity)
-                else:
-                    pairs.set_pieces(met.capacity)
+            if keeps:
+                listed.carry(met.count, met.carried, met.capacity)
+            else:
+                listed.set_pieces(met.capacity)
             self._is_forgotten = self._is_outrun = False
             self._searched += met.age(state, self._ageing)
             self._looked, self._is_searched = (self.looked()[0], True), False
         if not (is_ahead or met.expired_count or met.due_count):
             return
         find_near_pairs(
-            (int(not self._is_searched), *(pairs.capacity for pairs in lists), workers_for(1)),
+            (int(not self._is_searched), listed.capacity, workers_for(1)),
             Counters(self._taken, met.counters.found),
             met.on_device,
             Boxes(met.bounds.low, met.bounds.high),
             self._blocks,
-            PairLists(self.with_triangles.on_device, self.of_edges.on_device, self._ends),
+            listed.on_device,
             state.surface,
             self._rest,
             recovery,
             contacts.found,
         )
         self._is_searched = True
-
-    def make_room_for(self, ends: Sequence[int]) -> bool:
-        """Whether the lists were too short for what was searched, so that `find` has to go on; now there is room.
-
-        Args:
-            ends: that they need, as `find` left them in the list of contacts.
-        """
-        lists = (self.with_triangles, self.of_edges)
-        return True in [pairs.reach_to(end) for pairs, end in zip(lists, ends, strict=True)]
 
 
 def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Callable[[], Box]:

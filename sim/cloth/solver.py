@@ -1,6 +1,7 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir, push_nodes
 from sim.cloth.cells import cells_of
-from sim.cloth.continuous_contacts import ContinuousContacts, Turns
+from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.device_cells import DeviceCells
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
@@ -22,13 +23,13 @@ from sim.cloth.parameters import (
     RUNAWAY_SPEED,
     ClothParameters,
     shared_conflicts,
+    substeps_of,
 )
 from sim.cloth.pins import Pins
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
+from sim.cloth.springs import ACCURATE_SHARE, joined, resolved_share, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths, Load, finish_step
-from sim.cloth.threads import NO_TURN, RELAXED_BEYOND
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
@@ -42,10 +43,10 @@ SOLVER_NAME = "cloth"
 
 INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 
-REFINED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.02, 0.035
-"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; below
-which sweeps go back, and below which steps do: turns end (`RELAXED_BEYOND`) between both. It falls with every turn and
-sweep, and with the square of the step."""
+REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.03, 0.02, 0.035
+"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; beyond
+which springs and contacts take another turn; below which sweeps go back, and below which steps do: turns end between
+both. It falls with every turn and sweep, and with the square of the step."""
 
 FIXED_KEYS = frozenset(
     ("name", "shape", "position", "rotation_deg", "velocity", "material", "pin", "integrator", "substeps", "iterations")
@@ -53,33 +54,22 @@ FIXED_KEYS = frozenset(
 """What cannot change between frames; all else can."""
 
 
-class SpringTurns(Turns):
-    """Turns of springs in a substep of dt [s].
+class SpringTurns:
+    """Turns that the springs of some cloths take with contacts in a substep of dt [s].
 
-    Args:
-        integrator: of the springs.
-        dt: [s].
-        cloths: which take turns, (b,) bool.
-        foreseen: turns in the substep before.
+    Attributes:
+        taken: how many.
+        is_measured: whether it was asked how long springs are.
     """
 
-    def __init__(
-        self, integrator: XPBDSprings | ExplicitSprings, dt: float, cloths: NDArray[np.bool_], foreseen: int
-    ) -> None:
+    def __init__(self, integrator: XPBDSprings | ExplicitSprings, dt: float, cloths: NDArray[np.bool_]) -> None:
         self._integrator, self._dt, self._cloths = integrator, dt, cloths
         self._asked: Callable[[], NDArray[np.float64]] | None = None
-        self.decides = integrator.foresees(cloths)
-        self._foreseen, self.taken = foreseen, 0
+        self.taken, self.is_measured = 0, False
 
-    @property
-    def foreseen(self) -> int:
-        """As many as in the substep before, where the device decides."""
-        return min(self._foreseen, MOST_TURNS - self.taken) if self.decides else 0
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether it was asked how long springs are."""
-        return self._asked is not None
+    def measure(self) -> None:
+        """Ask how long springs are, which the host hears of when it needs to."""
+        self._asked, self.is_measured = functools.cache(self._integrator.excess(self._dt)), True
 
     @property
     def excess(self) -> NDArray[np.float64]:
@@ -87,23 +77,13 @@ class SpringTurns(Turns):
         assert self._asked is not None
         return self._asked()
 
-    def measure(self) -> None:
-        """Ask how long springs are, which decides nothing."""
-        self._asked = functools.cache(self._integrator.excess(self._dt))
-
-    def ask(self, *, ahead: int = 0) -> None:  # noqa: D102  (as `Turns` says, here and below)
-        turn = self.taken + ahead if self.decides else NO_TURN
-        self._asked = functools.cache(self._integrator.excess(self._dt, turn))
-
-    def take(self, *, is_ahead: bool = False) -> None:  # noqa: D102
-        self.taken += int(not is_ahead)
-        self._integrator.sweep(self._dt, self._cloths, is_ahead=is_ahead)
-
-    def go_on(self, *, pushes: bool) -> bool:  # noqa: D102
-        excess = self.excess[self._cloths].max(initial=0.0)
-        if self.decides:
-            self.taken = self._integrator.turns_taken
-        return pushes and self.taken < MOST_TURNS and excess > RELAXED_BEYOND
+    def relax(self) -> bool:
+        """Solve springs once more if they were too long when measured; whether they were."""
+        if self.taken == MOST_TURNS or self.excess[self._cloths].max(initial=0.0) < RELAXED_BEYOND:
+            return False
+        self.taken += 1
+        self._integrator.sweep(self._dt, self._cloths)
+        return True
 
 
 class ClothSolver:
@@ -172,6 +152,7 @@ class ClothSolver:
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
         self._totals = ClothTotals(self.state, self._springs, self._cells)
         self._frame_dt = 1.0 / frames_per_second
+        self._edges = [math.sqrt(sheet.grid.step_x * sheet.grid.step_y) if sheet.grid else 0.0 for sheet in sheets]
         self.air = ClothAir(self.state)
         self._forces = (forces or ForceField(())).on([(name,) for name in self.state.names])
         self._pins = Pins(self.parameters, sheets, self.state)
@@ -180,7 +161,7 @@ class ClothSolver:
         self._no_reasons = ti.ndarray(ti.i32, 3)
         self._no_reasons.fill(0)
         self._sweeps = self._refinement = 1
-        self._excess, self._turns_before = 0.0, 0
+        self._excess = 0.0
         self._hold_pins()
 
     def change(self, name: str, **changes: object) -> None:
@@ -307,7 +288,7 @@ class ClothSolver:
         state, integrator = self.state, self._integrator
         integrator.displace(dt, np.where(self._adapts, self._sweeps, self._iterations))
         is_loose = self._excess > RESTORED_BELOW or self._sweeps > 1  # else it does not matter by what
-        turns = SpringTurns(integrator, dt, self._takes_turns, self._turns_before)
+        turns = SpringTurns(integrator, dt, self._takes_turns)
         if self._adapts.any() and is_loose:
             turns.measure()
         by_springs = float(turns.excess[self._adapts].max()) if turns.is_measured else 0.0
@@ -319,7 +300,7 @@ class ClothSolver:
 
         if self.contacts is None or not self.contacts.resolve(state, dt, turns, conclude):
             conclude(self._no_reasons)
-        excess, self._turns_before = turns.excess, turns.taken
+        excess = turns.excess
         self._excess = float(excess[self._refines].max(initial=0.0))
         if by_springs > REFINED_BEYOND and self._sweeps < MOST_SWEEPS:
             self._sweeps *= 2
@@ -353,13 +334,24 @@ class ClothSolver:
         self.state.set_material(cloths)
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
-        self._integrator.take_parameters()
         self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
         self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
         self._refines = np.array([cloth.substeps is None for cloth in cloths])
         self._adapts = self._takes_turns & self._refines
+        self._integrator.take_parameters(self._resolved_shares())
         self.air.take_parameters(cloths)
         self._mass = float(self.state.mass.to_numpy().sum(dtype=np.float64))
+
+    def _resolved_shares(self) -> NDArray[np.float64]:
+        """How far steps resolve the waves of each cloth, (b,): nothing where more sweeps, or shorter steps, may not
+        take away what they leave unsolved; by the usual steps, also where these are shortened.
+        """
+        dt = self._frame_dt / substeps_of(self.parameters)
+        shares = [
+            resolved_share(cloth, edge, dt) if edge and adapts else 0.0
+            for cloth, edge, adapts in zip(self.parameters, self._edges, self._adapts, strict=True)
+        ]
+        return np.array(shares)
 
     def _largest_dts(self) -> tuple[float, float]:
         """Largest step without contacts [s]: of cloths that are given `substeps`, and of those that omit it.

@@ -84,10 +84,6 @@ class HostCloths:
         return np.repeat(np.asarray(values, dtype=np.float64), np.diff(self.first_triangle))
 
 
-OVER, GO_ON, OVER_WITH_MORE = 0, 1, 2
-"""What the first number of `ClothState.rounds` says; in the last case more steps of contacts have followed."""
-
-
 class ClothState:
     """Nodes, triangles and edges; n nodes, k triangles, e edges, b cloths.
 
@@ -109,8 +105,6 @@ class ClothState:
         eyelets: what nodes weigh besides their share of the sheet [kg], (n,).
         quantum: unit of the lattice [m].
         limit: end of the lattice on each axis, in quanta; nodes that come there are stopped.
-        rounds: of contacts in a substep, on the device: whether they `GO_ON`, so that springs take another turn; how
-            many these have taken; and how many contacts push, (3,).
     """
 
     def __init__(self, host: HostCloths, *, reach: float) -> None:
@@ -124,8 +118,6 @@ class ClothState:
         self.host = host
         self.quantum = quantum_of(reach)
         self.limit = int(reach / self.quantum)
-        self.rounds = ti.ndarray(ti.i32, 3)
-        self.rounds.fill(0)
         self.nodes: Nodes = with_room(Nodes, n, quantum=self.quantum)
         self.surface: Surface = with_room(Surface, n, displacement=self.nodes.displacement)
         self.lattice, _, self.inverse_mass, self.displacement, self.carry, self.velocity = self.nodes

@@ -4,12 +4,21 @@ from collections.abc import Callable
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
-from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
-from sim.cloth.parameters import MOST_TURNS
-from sim.cloth.state import GO_ON, OVER, ClothState
-from sim.core.arrays import Floats, Integers
+from sim.cloth.device_springs import (
+    LANES,
+    TINY_LENGTH,
+    DeviceSprings,
+    colour_bounds,
+    column,
+    offset_of,
+    set_column,
+)
+from sim.cloth.springs import KEPT_BY_THREADS, newmark_shares
+from sim.cloth.state import ClothState
+from sim.core.arrays import Integers
 from sim.core.bundles import func, with_room
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import runs_on_gpu
@@ -27,11 +36,6 @@ STRAIGHTENED = 0.35
 
 LEAST_WEIGHT = 1.0e-20  # inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions
 LEAST_ALIKE = 0.995  # cosine of the angle that a spring may turn by in a step for its direction to be that of the start
-
-RELAXED_BEYOND = float(np.float32(0.03))
-"""Excess of a spring [rest lengths] beyond which springs and contacts take another turn."""
-
-NO_TURN = -1
 
 LARGEST_RESIDUAL = 0.5
 """Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
@@ -66,20 +70,30 @@ class ThreadSolver:
         is_taut = ti.ndarray(ti.i32, len(starts) - 1)
         self._work: ThreadWork = with_room(ThreadWork, springs.count, is_taut=is_taut)
         self._found = ti.ndarray(ti.i32, 2)
+        self._resolves = False
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
             self._rows *= 2
 
-    def displace(self, state: ClothState, dt: float, *, is_first: bool, is_ahead: bool = False) -> None:
-        """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0.
+    def resolve_waves(self, resolved: NDArray[np.float64]) -> None:
+        """Say how far steps resolve the waves of each cloth (`springs.resolved_share`), (b,)."""
+        self._resolves = bool(resolved[list(self.springs.cloths)].any())
+        shares = newmark_shares(resolved[self.springs.cloth_of], KEPT_BY_THREADS)
+        self._work.shares.from_numpy(shares.astype(np.float32))
+        self._work.offset.fill(0.0)
 
-        If `is_ahead`, only where `ClothState.rounds` go on, of which the host does not know yet.
-        """
+    def foresee(self, state: ClothState, dt: float) -> None:
+        """Note what springs feel of a step of dt [s] by what their nodes do at its start, before these accelerate."""
+        if self._resolves:
+            self.springs.contract(state.nodes, state.carry)
+            offset_threads(self.springs.on_device, self.springs.count, state.nodes, dt, self._work)
+
+    def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
+        """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
         springs, nodes, step = self.springs, state.nodes, self.springs.first_colours.step
         springs.contract(nodes, state.displacement)
         for colour in springs.first_colours:
-            ahead = state.rounds, int(is_ahead)
-            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, *ahead, self._rows, step)
+            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, self._rows, step)
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for fixed directions.
@@ -92,16 +106,24 @@ class ThreadSolver:
         for colour in springs.first_colours:
             straighten_threads(springs.on_device, colour, state.nodes, dt, self._work, self._rows, step)
 
-    def excess(self, state: ClothState, dt: float, turn: int = NO_TURN) -> Callable[[], tuple[float, float, float]]:
-        """Asks for the largest excess of a spring [rest lengths], and how many have not converged (`excess_of`); and
-        how many turns springs had taken then.
-
-        If a `turn` is numbered, that decides whether `ClothState.rounds` go on; where they do not, nothing is measured.
+    def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
+        """Asks for the largest excess of a spring [rest lengths], and how many have not converged
+        (`excess_of`).
         """
-        springs, rounds = self.springs, (state.rounds, turn, MOST_TURNS, RELAXED_BEYOND)
-        return measure_excess.later(
-            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found, *rounds
-        )
+        springs = self.springs
+        return measure_excess.later(springs.on_device, springs.count, self._work, state.nodes, dt * dt, self._found)
+
+
+@kernel
+def offset_threads(springs: SpringArrays, count: ti.i32, nodes: Nodes, dt: ti.f32, work: ThreadWork):
+    """By how much springs are felt as shorter in a step (`springs.newmark_shares`)."""
+    for s in range(count):
+        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+        d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (nodes.carry[i] - nodes.carry[j])
+        length = d.norm()
+        ahead = (d + dt * (nodes.velocity[i] - nodes.velocity[j])).norm() - length
+        stretch = length - springs.law[s][0] + springs.shift[s]
+        work.offset[s] = offset_of(stretch, ahead, work.shares[s])
 
 
 @ti.func
@@ -187,8 +209,13 @@ def solve_forth(
                 set_column(after, at, column(before, at) + (column(u, at) - nodes.displacement[j]))
                 set_column(u, at, nodes.displacement[j])
                 set_column(x, at, nodes.lattice[j])
-                w_j[at], compliance[at] = nodes.inverse_mass[j], 1.0 / (law[1] * dt * dt)
-                missing[at] = law[0] - springs.shift[s] - ti.select(is_first, 0.0, compliance[at] * work.multiplier[s])
+                w_j[at], compliance[at] = nodes.inverse_mass[j], 1.0 / (work.shares[s][0] * law[1] * dt * dt)
+                missing[at] = (
+                    law[0]
+                    - springs.shift[s]
+                    + work.offset[s]
+                    - ti.select(is_first, 0.0, compliance[at] * work.multiplier[s])
+                )
         for at in range(LANES):
             length[at] = ti.max(column(after, at).norm(), TINY_LENGTH)
             direction = direction_of(column(before, at), column(after, at) / length[at])
@@ -260,8 +287,6 @@ def solve_threads(
     dt: ti.f32,
     is_first: ti.i32,
     work: ThreadWork,
-    rounds: Integers,
-    is_ahead: ti.i32,
     rows: ti.template(),
     colours: ti.template(),
 ):
@@ -271,10 +296,8 @@ def solve_threads(
 
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
-    Nothing is done if it `is_ahead` of `rounds` that do not go on.
     """
-    goes_on = ti.cast(is_ahead == 0 or rounds[0] == GO_ON, ti.i32)
-    threads = goes_on * ti.static(rows if runs_on_gpu() else 1)
+    threads = ti.static(rows if runs_on_gpu() else 1)
     c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
@@ -305,7 +328,7 @@ def solve_threads(
                     d = at_start + (u - ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1]))
                     length = ti.max(d.norm(), TINY_LENGTH)
                     n = direction_of(at_start, d / length)
-                    compliance = 1.0 / (springs.law[s][1] * dt * dt)
+                    compliance = 1.0 / (work.shares[s][0] * springs.law[s][1] * dt * dt)
                     if not is_first:
                         before = work.multiplier[s]
                 ti.simt.block.sync()
@@ -316,7 +339,7 @@ def solve_threads(
                 lower, diagonal, upper, missing = 0.0, 1.0, 0.0, 0.0
                 if k < count:
                     diagonal = w_i + w_j + compliance
-                    missing = springs.law[s][0] - springs.shift[s] - length - compliance * before
+                    missing = springs.law[s][0] - springs.shift[s] + work.offset[s] - length - compliance * before
                     if k > 0:
                         lower = -w_i * n.dot(ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1]))
                     if k + 1 < count:
@@ -430,33 +453,24 @@ def excess_of(
 
 @kernel
 def measure_excess(
-    springs: SpringArrays,
-    count: ti.i32,
-    multiplier: Floats,
-    nodes: Nodes,
-    dt_squared: ti.f32,
-    found: Integers,
-    rounds: Integers,
-    turn: ti.i32,
-    most_turns: ti.i32,
-    limit: ti.f32,
-) -> ti.math.vec3:
-    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`.
-
-    Before a `turn`, a number from 0 on, `rounds` go on if contacts push and the excess is above a limit, up to the
-    `most_turns`; if they did not before, what was found stays. Returns also how many turns have been taken.
-    """
-    is_asked = turn == NO_TURN or rounds[0] == GO_ON
-    end = ti.select(is_asked, count, 0)
-    whole_end = whole_warps(end)
-    if is_asked:
-        found[0], found[1] = 0, 0
+    springs: SpringArrays, count: ti.i32, work: ThreadWork, nodes: Nodes, dt_squared: ti.f32, found: Integers
+) -> ti.math.vec2:
+    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
+    end, whole_end = count, whole_warps(count)
+    found[0], found[1] = 0, 0
     for s in range(whole_end):
         excess = 0.0
         if s < end:
             i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
             excess = excess_of(
-                i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
+                i,
+                j,
+                springs.law[s][0],
+                springs.shift[s] - work.offset[s],
+                work.shares[s][0] * springs.law[s][1],
+                work.multiplier[s],
+                nodes,
+                dt_squared,
             )
         # Bits of numbers from 0 on are in their order.
         largest = largest_in_warp(ti.bit_cast(ti.select(excess > 0.0, excess, 0.0), ti.i32))
@@ -464,8 +478,4 @@ def measure_excess(
             ti.atomic_max(found[0], largest)
         if excess > LARGEST_RESIDUAL:
             ti.atomic_add(found[1], 1)
-    largest = ti.bit_cast(found[0], ti.f32)
-    if turn != NO_TURN and rounds[0] == GO_ON:
-        rounds[0] = ti.select(largest > limit and turn < most_turns and rounds[2] > 0, GO_ON, OVER)
-        rounds[1] = turn
-    return ti.math.vec3(largest, ti.cast(found[1], ti.f32), ti.cast(rounds[1], ti.f32))
+    return ti.math.vec2(ti.bit_cast(found[0], ti.f32), ti.cast(found[1], ti.f32))

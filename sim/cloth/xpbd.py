@@ -13,7 +13,7 @@ from sim.cloth.cells import TRIANGLE
 from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.state import ClothState
-from sim.cloth.threads import NO_TURN, ThreadSolver
+from sim.cloth.threads import ThreadSolver
 from sim.cloth.triangles import TriangleSolver
 from sim.core.arrays import Vectors
 from sim.core.bundles import func
@@ -142,9 +142,6 @@ class XPBDSprings:
     a thread, and triangles, by nothing. That falls with the square of the step, and with every further sweep. Bend
     springs have one sweep always.
 
-    Attributes:
-        turns_taken: in a substep, as `excess` found where it is told of turns.
-
     Args:
         state: what they move.
         springs: all springs.
@@ -154,40 +151,31 @@ class XPBDSprings:
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
         self._state = state
         self._momentum = AngularMomentumCorrection(state)
-        self._unconverged = self.turns_taken = 0
+        self._unconverged = 0
         self._bends = [family for family in springs if family.arity > PAIR]
         self._shears = [family for family in cells if family.arity != TRIANGLE]
         self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
         self._threads = [ThreadSolver(family) for family in springs if family.in_segments]
 
-    def take_parameters(self) -> None:
-        """Mass of meshes as it is now; lists of springs hold their stiffness."""
+    def take_parameters(self, resolved: NDArray[np.float64]) -> None:
+        """Mass of meshes as it is now, and how far steps resolve the waves of each cloth (`springs.resolved_share`),
+        (b,); lists of springs hold their stiffness.
+        """
+        for elements in (*self._threads, *self._shears):
+            elements.resolve_waves(resolved)
         for triangles in self._triangles:
             triangles.take_parameters()
 
-    def foresees(self, cloths: NDArray[np.bool_]) -> bool:
-        """Whether one list of threads alone decides if some of the cloths take another turn, and does so on the
-        device."""
-        return (
-            not self._triangles
-            and bool(cloths.all())
-            and [threads.springs.contracts for threads in self._threads] == [False]
-        )
-
-    def excess(self, dt: float, turn: int = NO_TURN) -> Callable[[], NDArray[np.float64]]:
+    def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:
         """Asks by how much threads, or meshes at a node, are longer than tension makes them, at most [rest lengths].
 
         Of each cloth; those that are solved in the same lists have the same. To be answered before springs or contacts
-        go on, but where these go on ahead. A `turn` that is numbered is told to threads.
+        go on.
         """
-        asked = [(threads.springs.cloths, threads.excess(self._state, dt, turn)) for threads in self._threads]
+        asked = [(threads.springs.cloths, threads.excess(self._state, dt)) for threads in self._threads]
 
         def answer() -> NDArray[np.float64]:
-            found = []
-            for cloths, excess in asked:
-                *of_threads, taken = excess()
-                found.append((cloths, *of_threads))
-                self.turns_taken = int(taken)
+            found = [(cloths, *excess()) for cloths, excess in asked]
             found += [(triangles.cloths, *triangles.excess()) for triangles in self._triangles]
             self._unconverged = sum(count for *_, count in found)
             largest = np.zeros(len(self._state.names))
@@ -206,7 +194,8 @@ class XPBDSprings:
         return float("inf")
 
     def accelerate(self, dt: float) -> None:
-        """Damp the velocities along springs between two nodes, and in the shear of rectangles.
+        """Damp the velocities along springs between two nodes, and in the shear of rectangles; and foresee from them
+        what these feel.
 
         Apart from their own sweep: there, a damping of gamma = tau / dt (Macklin et al. 2016, eq. 26) also brakes what
         the sweep has to undo of the prediction, and makes their largest stiffness 1 + gamma times smaller. Bend springs
@@ -219,6 +208,10 @@ class XPBDSprings:
         for cells in (each for each in self._shears if each.is_damped):
             for colour in cells.first_colours:
                 damp_shears(cells.on_device, colour, state.nodes, dt, cells.first_colours.step)
+        for threads in self._threads:
+            threads.foresee(state, dt)
+        for cells in self._shears:
+            cells.foresee(state.nodes, dt)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
@@ -232,19 +225,13 @@ class XPBDSprings:
             threads.straighten(self._state, dt)
         self._momentum.restore(dt)
 
-    def sweep(self, dt: float, cloths: NDArray[np.bool_], *, is_ahead: bool = False) -> None:
+    def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
         """Solve what bears tension in some cloths once more, after contacts have pushed: threads, and the triangles of
-        meshes; of threads alone, and only where rounds go on, if it `is_ahead` of what the host knows."""
-        self._sweep_lists([], dt, cloths, is_first=False, is_ahead=is_ahead)
+        meshes."""
+        self._sweep_lists([], dt, cloths, is_first=False)
 
     def _sweep_lists(
-        self,
-        solved: Sequence[DeviceCells],
-        dt: float,
-        cloths: NDArray[np.bool_],
-        *,
-        is_first: bool,
-        is_ahead: bool = False,
+        self, solved: Sequence[DeviceCells], dt: float, cloths: NDArray[np.bool_], *, is_first: bool
     ) -> None:
         """Lists hold only cloths that take the same sweeps."""
         for cells in solved:
@@ -253,7 +240,7 @@ class XPBDSprings:
             solve_shears(cells.on_device, self._state.nodes, dt * dt, int(is_first), cells.first_colours.stop)
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
-                threads.displace(self._state, dt, is_first=is_first, is_ahead=is_ahead)
+                threads.displace(self._state, dt, is_first=is_first)
         for triangles in self._triangles:
             if cloths[list(triangles.cloths)].any():
                 triangles.displace(dt, is_first=is_first)

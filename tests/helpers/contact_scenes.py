@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sim.build import build_world
 from sim.cloth.continuous_contacts import ContinuousContacts
-from sim.cloth.patch_pairs import PairList
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision import SelfCollision
 from sim.cloth.solver import ClothSolver
@@ -61,7 +60,7 @@ def find(state: ClothState, pairs: SelfCollision) -> ContactList:
     while True:
         contacts.found.counter.fill(0)
         pairs.find(state, contacts, 0.1)
-        if not pairs.make_room_for(contacts.found.counter.to_numpy()[1:3].tolist()):
+        if not pairs.listed.reach_to(int(contacts.found.counter.to_numpy()[1])):
             return contacts
 
 
@@ -132,13 +131,14 @@ def point_triangle_distances(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> 
     return np.min([*edges, np.where(inside, height, np.inf)], axis=0)
 
 
-def listed_places(pairs: SelfCollision, each: PairList) -> NDArray[np.int64]:
-    """Places of a list where a pair of elements is, in the order of their pairs of patches."""
-    first, _, found, _ = each.on_device.pieces.to_numpy()[: pairs.patch_pairs.count].T
+def listed_places(pairs: SelfCollision, are_edges: bool) -> NDArray[np.int64]:
+    """Places of the list where a pair of edges, or of a vertex and a triangle, is, in the order of pairs of patches."""
+    pieces = pairs.listed.on_device.pieces.to_numpy()[: 2 * pairs.patch_pairs.count]
+    first, _, found, _ = pieces[int(are_edges) :: 2].T
     return np.concatenate([np.arange(a, a + n) for a, n in zip(first, found, strict=True)])
 
 
 def listed_pairs(pairs: SelfCollision) -> list[list[tuple[int, ...]]]:
-    """The pairs of elements in both lists, vertices with triangles first, in an order of their own."""
-    lists = ((each, listed_places(pairs, each)) for each in (pairs.with_triangles, pairs.of_edges))
-    return [sorted(map(tuple, each.on_device.pairs.to_numpy()[places].tolist())) for each, places in lists]
+    """The listed pairs of elements, vertices with triangles first, in an order of their own."""
+    elements = pairs.listed.on_device.pairs.to_numpy()
+    return [sorted(map(tuple, elements[listed_places(pairs, each)].tolist())) for each in (False, True)]

@@ -58,12 +58,11 @@ def test_patches_of_very_uneven_meshes_have_like_numbers_of_triangles():
     assert sizes.min() >= TRIANGLES_PER_PATCH // 2
 
 
-def nothing_due(met: PatchPairs) -> tuple[ti.Ndarray, ti.Ndarray]:
-    """As lists have it in which nothing is listed."""
-    arrays = tuple(ti.ndarray(ti.f32, met.capacity) for _ in range(2))
-    for array in arrays:
-        array.fill(-1.0e30)
-    return arrays
+def nothing_due(met: PatchPairs) -> ti.Ndarray:
+    """As a list has it in which nothing is listed."""
+    due = ti.ndarray(ti.f32, 2 * met.capacity)
+    due.fill(-1.0e30)
+    return due
 
 
 def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
@@ -77,7 +76,7 @@ def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     collides.fill(1)
     met.meet(1.0, 1.0, collides)
     # All are searched: none are so far apart that they might sleep.
-    assert met.age(state, Ageing(1.0, 0.0, *nothing_due(met))) == met.count
+    assert met.age(state, Ageing(1.0, 0.0, nothing_due(met))) == met.count
     assert met.count == patches.count * (patches.count + 1) // 2
     corners = pieces(patches.corners, patches.first_corner)
     return met.on_device.approach.to_numpy()[: met.count], met.on_device.pairs.to_numpy()[: met.count], corners
@@ -121,8 +120,7 @@ def test_a_cloth_of_one_patch_meets_itself():
 def finish(state, pairs: SelfCollision, predicted: ti.Ndarray | None = None) -> list[int]:
     """A substep is over, with displacements that contacts changed from those `predicted`."""
     is_changed, predicted = predicted is not None, state.displacement if predicted is None else predicted
-    rounds = 0, ti.ndarray(ti.i32, 5), state.rounds
-    return pairs.finish(state, predicted, ContactList(1), 0, rounds, is_changed=is_changed)()
+    return pairs.finish(state, predicted, ContactList(1), 0, is_changed=is_changed)()
 
 
 def crumple(state, pairs: SelfCollision, count: int) -> None:
@@ -200,9 +198,10 @@ def test_pairs_keep_a_changed_thickness_where_a_thicker_cloth_changes_nothing():
     pairs.look(state)
     find(state, pairs)
     assert pairs.thickness == np.float32(0.008)
-    for each in (pairs.with_triangles, pairs.of_edges):
-        places = listed_places(pairs, each)
-        vertices, wanted = each.on_device.pairs.to_numpy()[places], each.on_device.wanted.to_numpy()[places]
+    listed = pairs.listed.on_device
+    for are_edges in (False, True):
+        places = listed_places(pairs, are_edges)
+        vertices, wanted = listed.pairs.to_numpy()[places], listed.wanted.to_numpy()[places]
         body = state.host.body[vertices]
         # What pairs keep is asked for when they are near: these are 1.1 mm apart, and a spacing or so aside.
         across = (wanted != UNKNOWN) & (body[:, 0] != body[:, 2])
@@ -241,8 +240,7 @@ def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
     state = state_of(13)
     roomy, tight = SelfCollision(state), SelfCollision(state)
     for pairs, capacity in ((roomy, 10**5), (tight, 1)):
-        pairs.with_triangles.resize(capacity)
-        pairs.of_edges.resize(capacity)
+        pairs.listed.resize(capacity)
         crumple(state, pairs, 40)
     assert min(len(each) for each in listed_pairs(tight)) > 100
     assert listed_pairs(tight) == listed_pairs(roomy)

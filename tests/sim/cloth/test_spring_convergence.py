@@ -75,7 +75,7 @@ def test_what_springs_exceed_their_tension_by_is_that_of_float64():
     solver.air.predict(solver.gravity, dt)
     solver._integrator.displace(dt, np.ones(1, dtype=int))
     (threads,) = solver._integrator._threads
-    largest, count, _ = threads.excess(state, dt)()
+    largest, count = threads.excess(state, dt)()
     nodes, law = (getattr(threads.springs.on_device, name).to_numpy() for name in ("nodes", "law"))
     rest, stiffness, _ = law.astype(np.float64).T
     places = state.lattice.to_numpy() * state.quantum + state.displacement.to_numpy()
