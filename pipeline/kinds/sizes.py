@@ -115,11 +115,15 @@ def size_of_liquid(job: Job, fluid: FluidParameters) -> float:
 def size_of_smoke(job: Job, smoke: SmokeParameters) -> float:
     """Optical size of the strongest source [m]: the diameter of the ball of its volume, times its density.
 
-    Sources that emit no smoke in the film count only if all are such. Raises as `measures_of`.
+    The soot that its fuel leaves counts as well. Sources that emit no smoke in the film count only if all are such.
+    Raises as `measures_of`.
     """
     diameters = [(6.0 / pi * measures_of(source).volume) ** (1.0 / 3.0) for source in smoke.source]
+    soot = 0.0 if smoke.fire is None else smoke.fire.soot
     strengths = [
-        source.density * source.largest_strength(0.0, job.film_s) if source.emits_during(0.0, job.film_s) else 0.0
+        (source.density + soot * source.fuel) * source.largest_strength(0.0, job.film_s)
+        if source.emits_during(0.0, job.film_s)
+        else 0.0
         for source in smoke.source
     ]
     return max(map(prod, zip(diameters, strengths, strict=True))) or max(diameters)

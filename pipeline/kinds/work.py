@@ -224,6 +224,7 @@ def _smoke_steps(job: Job, index: int) -> float:
         lift * abs(source.temperature - smoke.ambient_temperature) + smoke.buoyancy_density * source.density
         for source in smoke.source
     )
+    pull = max(pull, lift * smoke.hottest_excess)
     fastest = max(math.hypot(*(source.velocity or (0.0, 0.0, 0.0))) for source in smoke.source)
     rise = RISING_SHARE * math.sqrt(fastest**2 + 2.0 * pull * size)
     speed = max(rise, PASSING_FACTOR * math.hypot(*smoke.wind))

@@ -259,14 +259,6 @@ class SmokeGrid:
         nx, ny, nz = (n + (a == axis) for a, n in enumerate(self.cells))
         return nx, ny, nz
 
-    def cells_inside(self, region: HasSignedDistance) -> NDArray[np.bool_]:
-        """Cells whose centre lies in a region, (nx, ny, nz)."""
-        return self._inside(region, self.cells, CENTRE)
-
-    def faces_inside(self, region: HasSignedDistance, axis: int) -> NDArray[np.bool_]:
-        """Faces whose centre lies in a region, `face_shape(axis)`."""
-        return self._inside(region, self.face_shape(axis), _face_offset(axis))
-
     @cached_property
     def open_area(self) -> tuple[NDArray[np.bool_], ...]:
         """Which faces air passes in part at least, by axis, `face_shape(axis)`."""
@@ -288,13 +280,6 @@ class SmokeGrid:
             low + (np.arange(n) + shift) * self.cell_size
             for low, n, shift in zip(self.origin, shape, offset, strict=True)
         ]
-
-    def _inside(self, region: HasSignedDistance, shape: Index3, offset: Sequence[float]) -> NDArray[np.bool_]:
-        """Which places lie inside a region."""
-        inside = np.zeros(shape, bool)
-        spans, near = self._distances(region, shape, offset)
-        inside[spans] = near < 0.0
-        return inside
 
     def _distances(
         self, region: HasSignedDistance, shape: tuple[int, ...], offset: Sequence[float], *, margin: float = 0.0

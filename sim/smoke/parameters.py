@@ -34,6 +34,9 @@ class SmokeSourceParameters(Placement):
 
     density: Fraction = Field(default=1.0, description="Smoke density inside the source [-].")
     temperature: Positive = Field(default=450.0, description="Temperature inside the source [K].")
+    fuel: Fraction = Field(
+        default=0.0, description="Part of the gas inside that is fuel [-]; it burns as [smoke.fire] says."
+    )
     fluctuation: Fraction = Field(
         default=0.2,
         description="How far its heat falls short of that, at random in space and time [-]; "
@@ -118,6 +121,28 @@ class TurbulenceParameters(Parameters):
     seed: Seed = Field(default=0, description="Of their random numbers.")
 
 
+class FireParameters(Parameters):
+    """How the fuel burns that sources emit: what it heats, how much soot is left, how far the gas expands."""
+
+    ignition_temperature: Positive = Field(
+        default=600.0, description="Temperature from which on fuel burns [K]; wood gas takes fire at 550 to 700 K."
+    )
+    burn_rate: Positive = Field(
+        default=2.0,
+        description="Fuel that burns in a second [1/s]: pure fuel is burnt after 1 / burn_rate, so flames are as long "
+        "as gas gets in that time.",
+    )
+    heat: NonNegative = Field(
+        default=1500.0, description="By how much pure fuel is hotter once it is burnt [K]; in part, by that part."
+    )
+    soot: NonNegative = Field(default=0.5, description="Smoke that burning pure fuel makes: its density [-].")
+    expansion: Fraction = Field(
+        default=1.0,
+        description="How much of the expansion of an ideal gas the heat of burning gives [-]: 1: volume grows with "
+        "the temperature, 0: not at all, as in a closed box.",
+    )
+
+
 class SmokeParameters(Parameters):
     """Hot smoke in a box of cells: its sources, its physics and its numerics."""
 
@@ -153,8 +178,11 @@ class SmokeParameters(Parameters):
     cooling: NonNegative = Field(default=0.2, description="Rate at which it cools to the air's temperature [1/s].")
     radiative_cooling: NonNegative = Field(
         default=0.0,
-        description="Rate at which gas as hot as the hottest source cools by radiation, on top [K/s]; it falls with "
-        "the fourth power of the excess over the air (Nguyen et al. 2002). Fires have some thousands.",
+        description="Rate at which gas as hot as the hottest source or flame cools by radiation, on top [K/s]; it "
+        "falls with the fourth power of the excess over the air (Nguyen et al. 2002). Fires have some thousands.",
+    )
+    fire: FireParameters | None = Field(
+        default=None, description="How the fuel of its sources burns; none has any if omitted."
     )
     wind: Vector3 = Field(
         default=(0.0, 0.0, 0.0),
@@ -181,10 +209,47 @@ class SmokeParameters(Parameters):
             )
         return self
 
+    @model_validator(mode="after")
+    def _can_burn(self) -> Self:
+        fuelled = [number for number, source in enumerate(self.source) if source.fuel > 0.0]
+        if self.fire is None:
+            if fuelled:
+                raise KeyRefusedError(
+                    ("source", fuelled[0], "fuel"), "has no meaning without a fire; add [smoke.fire], or leave it out"
+                )
+            return self
+        ignition = self.fire.ignition_temperature
+        if not fuelled:
+            raise KeyRefusedError(("fire",), "has nothing to burn; give a source fuel")
+        if ignition <= self.ambient_temperature:
+            raise KeyRefusedError(
+                ("fire", "ignition_temperature"),
+                f"{ignition:g} K is no more than the air's {self.ambient_temperature:g} K: fuel would burn at once",
+            )
+        if max(source.temperature for source in self.source) < ignition:
+            raise KeyRefusedError(
+                ("fire", "ignition_temperature"),
+                f"{ignition:g} K is more than any source has: nothing takes fire; give one a higher temperature",
+            )
+        if self.fire.expansion > 0.0 and not self.open_faces:
+            raise KeyRefusedError(
+                ("fire", "expansion"),
+                "has no room in a box without open faces, as its air cannot be compressed; set it to 0, or open a side",
+            )
+        return self
+
     @property
     def hottest_excess(self) -> float:
-        """Of the hottest source, over the air's temperature [K]; 0 if none is hotter than that."""
-        return max(0.0, *(source.temperature - self.ambient_temperature for source in self.source))
+        """Of the hottest source, or of what burns, over the air's temperature [K]; 0 if nothing is hotter than that."""
+        hottest = [source.temperature for source in self.source]
+        if self.fire is not None:
+            fire = self.fire
+            hottest += [
+                max(source.temperature, fire.ignition_temperature) + fire.heat * source.fuel
+                for source in self.source
+                if source.fuel > 0.0
+            ]
+        return max(0.0, max(hottest) - self.ambient_temperature)
 
     def lift_per_kelvin(self, gravity: Vector3) -> float:
         """Upward acceleration beta for each kelvin of excess [m/(s² K)], under a gravity [m/s²]."""

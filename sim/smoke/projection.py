@@ -6,8 +6,9 @@ the solver stops by what is asked for: max|div u| h / max|u|.
 
 Where solids cut cells the open part A of a face counts, and with it its conductance; its velocity is that in the open
 part (Batty, Bertails & Bridson 2007; Ng, Min & Gibou 2009). What moves with the velocity u_solid on the closed part
-drives the air: the flux through a face is A u + (1 - A) u_solid. A closed region has a solution only if no volume flows
-into it in sum. What obstacles press into it all the same, as a piston does, is spread evenly over its air: it is
+drives the air: the flux through a face is A u + (1 - A) u_solid. Gas that burns expands
+(`sim.smoke.combustion`): there div u is what that asks for. A closed region has a solution only if no volume flows into
+it in sum. What obstacles press into it all the same, as a piston does, is spread evenly over its air: it is
 compressed, or expands, at the same rate everywhere.
 
 Flexible conjugate gradients (Notay 2000) because the preconditioner is not symmetric. When the recursion has reached
@@ -69,10 +70,20 @@ class PressureProjection:
         work: six float32 arrays of at least the grid's size, free between two projections.
     """
 
-    def __init__(self, obstacles: Obstacles, velocity: Faces, *, tolerance: float, max_iterations: int) -> None:
+    def __init__(
+        self,
+        obstacles: Obstacles,
+        velocity: Faces,
+        *,
+        tolerance: float,
+        max_iterations: int,
+        expansion: ti.Ndarray | None = None,
+    ) -> None:
+        """Take what is in the way, the velocity, and the divergence that is to be left, times h [m/s], if any."""
         self._tolerance, self._max_iterations = tolerance, max_iterations
         self._cell_size = obstacles.grid.cell_size
         self._box, self._obstacles, self._velocity = obstacles.box, obstacles, velocity
+        self._expands, self._expansion = expansion is not None, new_floats(1) if expansion is None else expansion
         self.multigrid = MultigridVCycle(obstacles)
         self.regions = ClosedRegions(obstacles)
         equation, size = self.multigrid.equation, obstacles.grid.size
@@ -120,12 +131,12 @@ class PressureProjection:
         return max_iterations
 
     def _measure(self) -> tuple[float, float, float]:
-        """Set the residual to -h div u, less its mean in closed regions.
+        """Set the residual to h (expansion - div u), less its mean in closed regions.
 
         Returns:
             Its largest magnitude, the largest face velocity, and the largest magnitude of a mean.
         """
-        given = self._box, self._obstacles.solids, self._velocity, self._search
+        given = self._box, self._obstacles.solids, self._velocity, self._expansion, self._expands, self._search
         largest, speed = _compute_residual(*given)
         mean = self.regions.subtract_means(self._search.equation.right_hand_side, largest)
         if mean > 0.0:
@@ -140,7 +151,9 @@ class PressureProjection:
 
 
 @kernel
-def _compute_residual(box: Grid, solids: Solids, velocity: Faces, search: Search) -> Pair:
+def _compute_residual(
+    box: Grid, solids: Solids, velocity: Faces, expansion: Floats, expands: ti.template(), search: Search
+) -> Pair:
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
         largest = 0.0
         speed = 0.0
@@ -153,6 +166,8 @@ def _compute_residual(box: Grid, solids: Solids, velocity: Faces, search: Search
                 residual = flux_part(solids, 0, at) * u - flux_part(solids, 0, at + box.step_x) * u_next
                 residual += flux_part(solids, 1, at) * v - flux_part(solids, 1, at + box.step_y) * v_next
                 residual += flux_part(solids, 2, at) * w - flux_part(solids, 2, at + 1) * w_next
+            if ti.static(expands):
+                residual += mean_volume(solids, at) * expansion[at]
             if ti.static(solids.moving):
                 if (solids.words[at] & (NEAR_SOLIDS | CHANGES)) != 0:
                     residual += wall_flux(box, solids, at)

@@ -20,6 +20,7 @@ from sim.forces.field import ForceField
 from sim.shapes.solid import HasSignedDistance
 from sim.smoke.advection import Advection
 from sim.smoke.arrays import new_state
+from sim.smoke.combustion import Combustion
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import accelerate, cool, upward
 from sim.smoke.grid import Index3, SmokeGrid, Window
@@ -41,13 +42,13 @@ RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed o
 class SmokeSolver:
     """Density, temperature and velocity of smoke in a box of cells, with solids in it that stand still or move.
 
-    One substep, by operator splitting as in Stam 1999: advect velocity, let obstacles move on, accelerate, emit,
+    One substep, by operator splitting as in Stam 1999: advect velocity, let obstacles move on, accelerate, emit, burn,
     project, carry smoke and heat with what came of it, cool. Incompressible air of constant density (Boussinesq): smoke
-    and heat act through buoyancy alone.
+    and heat act through buoyancy alone, but for fuel that burns, which expands (`combustion`).
 
     Exact, but for rounding: smoke is added by sources and leaves through open sides only, what sources add is counted,
     and heat is kept likewise (`Transport`). Heat lets air rise by the strength of gravity, unless the parameters say
-    how fast, and does not expand it.
+    how fast, and does not expand it unless it comes of burning.
 
     Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`sim.smoke.sides`).
 
@@ -106,7 +107,7 @@ class SmokeSolver:
         self.obstacles = Obstacles(self.grid, moving=moving)
         self._compute_in_grid()
         require_cells(parameters, self.sources, self.grid)
-        self._emitted_mass = 0.0
+        self._emitted_mass, self._burnt_fuel, self._expanded = 0.0, 0.0, 0.0
         self.begin_frame(0.0)
         if any(parameters.wind):
             if cut_off := self.grid.cut_off_faces():
@@ -120,11 +121,16 @@ class SmokeSolver:
         """Have room for air at rest in the grid, and all that changes it."""
         parameters = self.parameters
         self.state = new_state(self.grid.size)
+        self._combustion: Combustion | None = None
+        if parameters.fire is not None:
+            given = {"ambient_temperature": parameters.ambient_temperature, "cell_size": self.grid.cell_size}
+            self._combustion = Combustion(parameters.fire, self.grid.size, **given)
         self._projection = PressureProjection(
             self.obstacles,
             self.state.velocity,
             tolerance=parameters.projection_tolerance,
             max_iterations=parameters.projection_max_iterations,
+            expansion=None if self._combustion is None else self._combustion.expansion,
         )
         operator, work = self._projection.multigrid.coefficients.operator, self._projection.work
         self.air = Air(self.obstacles.box, self.obstacles.solids, operator.faces, self.state)
@@ -134,7 +140,8 @@ class SmokeSolver:
             work,
             maccormack=parameters.advection == "maccormack",
         )
-        self._transport = Transport(self.air, work, sharpens=parameters.advection == "maccormack")
+        sharpens = parameters.advection == "maccormack"
+        self._transport = Transport(self.air, work, sharpens=sharpens, combustion=self._combustion)
         self._open_sides = self.grid.open_sides
         self._extrapolation = Extrapolation(self.obstacles, self.state.velocity, work[:3], reach=parameters.cfl)
         self._rows = new_rows(self.air.box)
@@ -151,7 +158,7 @@ class SmokeSolver:
         if window == self.grid.window:
             return
         self._require_room(window)
-        state, grid, box, moving = self.state, self.grid, self.obstacles.box, self.obstacles.moving
+        cells, grid, box, moving = self._arrays, self.grid, self.obstacles.box, self.obstacles.moving
         movers = self.obstacles.movers
         self.air_forces.clear()
         # All but the state is given up before there is more.
@@ -163,7 +170,7 @@ class SmokeSolver:
         self._compute_in_grid()
         if any(self._outside.velocity):
             start_wind(self.air, self._outside.velocity, self.parameters.windward_faces)
-        carry_over(state, (grid, box), self.state, (self.grid, self.obstacles.box))
+        carry_over(cells, (grid, box), self._arrays, (self.grid, self.obstacles.box))
         for mover in movers:
             mover.exchange(0.0)
         self.move_obstacles()
@@ -192,7 +199,8 @@ class SmokeSolver:
     def _arrays(self) -> dict[str, ti.Ndarray]:
         """The state by the names of a checkpoint."""
         names = ("u_face_x", "v_face_y", "w_face_z", "density", "excess_temperature")
-        return dict(zip(names, (*self.state.velocity, self.state.density, self.state.excess), strict=True))
+        arrays = dict(zip(names, (*self.state.velocity, self.state.density, self.state.excess), strict=True))
+        return arrays if self._combustion is None else {**arrays, "fuel": self._combustion.fuel}
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no air crosses more than `cfl` cells, and no obstacle more than one.
@@ -218,6 +226,7 @@ class SmokeSolver:
         self._accelerate(dt)
         blow_in(self.air, self._outside.velocity, self.parameters.windward_faces)
         self._emit(dt)
+        self._burn(dt)
         operator, step = self._projection.multigrid.coefficients.operator, dt / self.grid.cell_size
         brake_inflow(self.air, operator, self._open_sides, self.grid.cells, self._outside.velocity, step)
         self._projections.append(self._projection.project())
@@ -276,9 +285,10 @@ class SmokeSolver:
         """The state with its ghosts, the obstacles that move, the time and the counted masses."""
         arrays = {name: values.to_numpy().reshape(self.grid.padded) for name, values in self._arrays.items()}
         clock = np.array([self.time_s, self._emitted_mass])
+        burnt = {} if self._combustion is None else {"burnt": np.array([self._burnt_fuel, self._expanded])}
         window = {"window": np.array([self.grid.first, self.grid.cells])} if self._fitting.follows else {}
         outside = {"outside": np.array(self._outside.velocity)} if self._outer.blows else {}
-        return {**arrays, **self.obstacles.checkpoint(), **window, **outside, "clock": clock}
+        return {**arrays, **self.obstacles.checkpoint(), **window, **outside, **burnt, "clock": clock}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -292,6 +302,8 @@ class SmokeSolver:
         moving = ["obstacles"] if self.obstacles.moving else []
         expected = {**dict.fromkeys([*self._arrays, *moving], self.grid.padded), "clock": (2,)}
         expected |= {"outside": (3,)} if self._outer.blows else {}
+        if self._combustion is not None:
+            expected["burnt"] = (2,)
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
@@ -305,13 +317,17 @@ class SmokeSolver:
         if self._outer.blows:
             x, y, z = arrays["outside"].tolist()
             self._outside.velocity = x, y, z
+        if self._combustion is not None:
+            self._burnt_fuel, self._expanded = arrays["burnt"].tolist()
 
     def diagnostics(self) -> Diagnostics:
         """Totals of the state, and the projections of the frame.
 
         `mass` and `emitted_mass` are integrals of density over the open parts of cells [m³]; `iterations` is the sum
         over the frame, `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame. Where
-        obstacles may move there is also `compression` [1/s], the worst of the frame (`ProjectionReport`).
+        obstacles may move there is also `compression` [1/s], the worst of the frame (`ProjectionReport`). Where fuel
+        burns its soot counts as emitted, and there are the integrals of the fuel, of what has burnt so far, and the
+        volume by which gas has expanded [m³].
         """
         speed, _ = self._find_speed_and_acceleration()
         volume = self.obstacles.open_volume().astype(np.float64)
@@ -326,6 +342,9 @@ class SmokeSolver:
             "divergence": max((report.divergence for report in self._projections), default=0.0),
             "not_converged": float(sum(not report.converged for report in self._projections)),
         }
+        if self._combustion is not None:
+            numbers["fuel"] = float((self._cells("fuel") * volume).sum()) * self.grid.cell_size**3
+            numbers |= {"burnt_fuel": self._burnt_fuel, "expanded": self._expanded}
         if self._fitting.follows:
             numbers["cells"] = float(np.prod(self.grid.cells))
         if self.obstacles.moving:
@@ -360,6 +379,16 @@ class SmokeSolver:
         for source in self.sources:
             if source.parameters.emits_during(self.time_s, self.time_s + dt):
                 self._emitted_mass += source.emit(self.air, self.time_s, dt) * self.grid.cell_size**3
+                if self._combustion is not None and source.parameters.fuel > 0.0:
+                    source.add_fuel(self.air, self._combustion.fuel, self.time_s, dt)
+
+    def _burn(self, dt: float) -> None:
+        if self._combustion is not None:
+            burnt, grown = self._combustion.burn(self.air, dt, self._rows)
+            volume = self.grid.cell_size**3
+            self._burnt_fuel += burnt * volume
+            self._expanded += grown * volume
+            self._emitted_mass += self._combustion.parameters.soot * burnt * volume
 
     def _follow_obstacles(self) -> None:
         self._projection.update()

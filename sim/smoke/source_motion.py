@@ -1,4 +1,4 @@
-"""Where sources that move are, along keyframes or on a rigid body, and which cells and faces they pass over."""
+"""Where sources are, along keyframes or on a rigid body, and how much of cells and faces they pass over."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 COSTLY_SHAPES = (DuckShape, BunnyShape, MeshShape)  # their distances take long, and so are looked up
-LOOKUPS_PER_CELL = 2.0  # nodes of such a table along the edge of a cell
+LOOKUPS_PER_CELL = 4.0  # nodes of such a table along the edge of a cell
 ROUND_OFF = 1.0e-9  # of ways and distances, in parts of them and in cells, at most
+ROUNDING = 2.0**-16  # of covered parts, so that what is symmetric stays so
+PARTS = 4  # points along the edge of a cell at which it is asked how much of it is covered
 CELLS = 3  # stands for cells where the axis of faces is asked for
 
 
@@ -136,12 +138,16 @@ class Swept:
     """The places that a shape passed over."""
 
     indices: NDArray[np.int32]  # of the places in flat arrays, ascending, (n,)
+    shares: NDArray[np.float64]  # parts of the cells around them that it covered [-], above 0, (n,)
     places: NDArray[np.float64]  # their positions [m], (n, 3)
-    poses: NDArray[np.int64]  # which of the poses was the last to cover each, (n,)
+    poses: NDArray[np.int64]  # which of the poses was the last to touch each, (n,)
 
 
 class SweptShape:
-    """A shape that moves over a grid; a place is covered if it lies inside, as for shapes that stay.
+    """A shape that stays in a grid or moves over it, which covers parts of cells, and of the cells around faces.
+
+    A part is found from signed distances d at `PARTS`³ points of a cell, s apart, as the mean of 1/2 - d/s between 0
+    and 1. A ball of radius R is larger than it is by (s/R)²/4: by 0.7 % at one and a half cells of radius.
 
     Attributes:
         reach: largest distance of its points from its origin [m].
@@ -162,6 +168,11 @@ class SweptShape:
         if not self._is_exact:
             spacing = cell_size / LOOKUPS_PER_CELL
             self._distance = LevelSet.sample(self._solid, spacing, exact_within=2.0 * spacing).signed_distance
+        steps = (np.arange(PARTS) + 0.5) / PARTS - 0.5
+        points = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        self._points = cell_size * points  # about the middle of a cell [m], (PARTS³, 3)
+        # Farther from the surface than this a cell is covered whole, or not at all.
+        self._margin = cell_size * (0.5 * math.sqrt(3.0) + 0.5 / PARTS)
 
     def bounds(self, pose: Motion) -> Array:
         """Corners of the box around the shape in a pose [m], (2, 3)."""
@@ -169,50 +180,78 @@ class SweptShape:
         return PlacedSolid(self._solid.shape, self._solid.scale, turned, pose.position).bounds
 
     def covered(self, grid: SmokeGrid, poses: Sequence[Motion], axis: int) -> Swept:
-        """The faces of a grid across an axis, or the `CELLS`, that it covers in one of the poses at least."""
+        """The faces of a grid across an axis, or the `CELLS`, that it covers a part of in one of the poses."""
         shape: Index3 = grid.cells if axis == CELLS else grid.face_shape(axis)
         offset = np.array([0.0 if a == axis else 0.5 for a in range(3)])
         windows = [self._window(grid, pose, shape, offset) for pose in poses]
         first = np.min([low for low, _ in windows], axis=0)
         size = np.maximum(np.max([high for _, high in windows], axis=0) - first, 0)
-        last = np.full(size, -1, np.int64)
-        # Backwards, so that what a later pose covers need not be looked at again. No more need what is farther off
-        # than the shape has gone since it was looked at.
+        last, shares = np.full(size, -1, np.int64), np.zeros(size)
+        # Cells near the surface have rows: of the least distances of their points, and of when these need be asked.
+        rows, count = np.full(size, -1, np.int64), len(self._points)
+        nearest, spare = np.empty((0, count)), np.empty((0, count))
+        half = 0.5 * grid.cell_size / PARTS
+        # Backwards, so that what a later pose covers whole need not be looked at again. No more need what is farther
+        # off than the shape has gone since it was looked at.
         free_until = np.full(size, -np.inf)
         ways = self._ways_to_the_last(poses)
         for number in reversed(range(len(poses))):
             pose, (low, high) = poses[number], windows[number]
             window = tuple(map(slice, low - first, high - first))
-            asked = np.nonzero((last[window] < 0) & (free_until[window] <= ways[number]))
+            asked = np.nonzero((shares[window] < 1.0) & (free_until[window] <= ways[number]))
             if len(asked[0]) == 0:
                 continue
             places = _positions(grid, np.stack(asked, axis=-1) + low, offset)
-            own = rotation.rotated(rotation.conjugate(pose.orientation), places - pose.position)
-            distance = self._distance(own)
-            last[window][asked] = np.where(distance < 0.0, number, -1)
+            distance = self._distances(pose, places)
             if self._is_exact:
-                free_until[window][asked] = ways[number] + distance
-        found = np.argwhere(last >= 0) + first
+                free_until[window][asked] = ways[number] + distance - self._margin
+            cut = np.abs(distance) <= self._margin
+            found = tuple(index[cut] for index in asked)
+            row = rows[window][found]
+            row[row < 0] = len(nearest) + np.arange((row < 0).sum())
+            rows[window][found] = row
+            more = max(0, row.max(initial=-1) + 1 - len(nearest))
+            nearest = np.concatenate([nearest, np.full((more, count), np.inf)])
+            spare = np.concatenate([spare, np.full((more, count), -np.inf)])
+            at = np.nonzero((nearest[row] > -half) & (spare[row] <= ways[number]))
+            off = self._distances(pose, places[cut][at[0]] + self._points[at[1]])
+            at = row[at[0]], at[1]
+            nearest[at] = np.minimum(nearest[at], off)
+            if self._is_exact:
+                spare[at] = ways[number] + off - np.minimum(nearest[at], half)
+            part = np.clip(0.5 - nearest[row] / (2.0 * half), 0.0, 1.0).mean(axis=1)
+            now = np.where(distance < 0.0, 1.0, 0.0)
+            now[cut] = np.round(part / ROUNDING) * ROUNDING
+            is_new = (last[window][asked] < 0) & (now > 0.0)
+            last[window][tuple(index[is_new] for index in asked)] = number
+            shares[window][asked] = np.maximum(shares[window][asked], now)
+        indices = np.argwhere(last >= 0) + first
         padded = grid.padded
-        indices = ((found[:, 0] + 1) * padded[1] + found[:, 1] + 1) * padded[2] + found[:, 2] + 1
-        return Swept(indices.astype(np.int32), _positions(grid, found, offset), last[last >= 0])
+        flat = ((indices[:, 0] + 1) * padded[1] + indices[:, 1] + 1) * padded[2] + indices[:, 2] + 1
+        is_covered = last >= 0
+        return Swept(flat.astype(np.int32), shares[is_covered], _positions(grid, indices, offset), last[is_covered])
+
+    def _distances(self, pose: Motion, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distances [m] of positions (n, 3) from the shape in a pose, (n,)."""
+        return self._distance(rotation.rotated(rotation.conjugate(pose.orientation), places - pose.position))
 
     def _ways_to_the_last(self, poses: Sequence[Motion]) -> NDArray[np.float64]:
         """Bound of how far points of the shape go from each pose to the last one [m], (n,)."""
         origins = np.stack([pose.position for pose in poses])
         turned = np.stack([rotation.matrices(pose.orientation) for pose in poses])
         steps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
-        turns = np.linalg.norm(np.diff(turned, axis=0), axis=(1, 2))
+        turns = np.linalg.norm(np.diff(turned, axis=0), axis=(1, 2)) / math.sqrt(2.0)
         ways = (1.0 + ROUND_OFF) * (steps + self.reach * turns) + ROUND_OFF * self._cell_size
         return np.append(np.cumsum(ways[::-1])[::-1], 0.0)
 
     def _window(
         self, grid: SmokeGrid, pose: Motion, shape: Index3, offset: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The first place within the shape's box along each axis, from 0, and the first one after it."""
+        """The first place along each axis, from 0, that may be covered in part, and the first one after the last."""
+        margin = 0.5 + 0.5 / PARTS
         lower, upper = (self.bounds(pose) - grid.origin) / grid.cell_size - offset
-        low = np.clip(np.ceil(lower), 0, shape).astype(np.int64)
-        return low, np.clip(np.floor(upper) + 1, low, shape).astype(np.int64)
+        low = np.clip(np.ceil(lower - margin), 0, shape).astype(np.int64)
+        return low, np.clip(np.floor(upper + margin) + 1, low, shape).astype(np.int64)
 
 
 def _positions(grid: SmokeGrid, places: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:

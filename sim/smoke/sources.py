@@ -14,7 +14,7 @@ from sim.core.hashed_numbers import hash_to_unit, smooth_noise, spread
 from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.motion import rotation
-from sim.shapes.placement import PlacedSolid, build_solid
+from sim.core.motion.paths import Motion
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid
 from sim.smoke.obstacles import Air, is_solid, part_before
@@ -44,35 +44,42 @@ class _Places:
     def __init__(self) -> None:
         self.count = 0
         self.indices = ti.ndarray(ti.i32, 1)
-        self.values = ti.ndarray(ti.f32, 1)
+        self.shares, self.speeds = ti.ndarray(ti.f32, 1), ti.ndarray(ti.f32, 1)
 
-    def put(self, indices: NDArray[np.int32], values: NDArray[np.float64] | float = 0.0) -> None:
-        """Take flat indices, (n,), and a value for each."""
+    def put(
+        self, indices: NDArray[np.int32], shares: NDArray[np.float64], speeds: NDArray[np.float64] | None = None
+    ) -> None:
+        """Take flat indices, covered parts [-] and, of faces, velocities [m/s], (n,) each."""
         self.count = len(indices)
         room = self.indices.shape[0]
         if self.count > room:
             room = max(self.count, 2 * room)
-            self.indices, self.values = ti.ndarray(ti.i32, room), ti.ndarray(ti.f32, room)
-        padded = np.zeros(room, np.int32), np.zeros(room, np.float32)
-        padded[0][: self.count], padded[1][: self.count] = indices, values
-        self.indices.from_numpy(padded[0])
-        self.values.from_numpy(padded[1])
+            self.indices, self.shares = ti.ndarray(ti.i32, room), ti.ndarray(ti.f32, room)
+            self.speeds = ti.ndarray(ti.f32, room)
+        for array, values in ((self.indices, indices), (self.shares, shares), (self.speeds, speeds)):
+            if values is not None:
+                padded = np.zeros(room, np.int32 if array is self.indices else np.float32)
+                padded[: self.count] = values
+                array.from_numpy(padded)
 
 
 class Source:
-    """One source on one grid: the open cells and faces whose centres lie inside it.
+    """One source on one grid: the open cells and faces, or parts of them, that it covers.
 
-    What an obstacle covers just now emits nothing. A source that moves emits where it is in any part of the step, so
-    that what it leaves behind in air at rest is its swept volume, however long the steps are.
+    A cell of which it covers a part is raised to that part of what whole ones are raised to, so that air at rest gets
+    the source's values times its volume, wherever it lies between cells. What an obstacle covers just now emits
+    nothing. A source that moves emits where it is in any part of the step, so that what it leaves behind in air at rest
+    is its swept volume, however long the steps are.
 
     Velocity is imposed before the projection, which may change it: a source drives the flow, it is no inlet. So it
-    never creates volume, and also blows in a closed box.
+    never creates volume, and also blows in a closed box. Faces get it by the covered part of the cell around them
+    (Fadlun et al. 2000, J. Comput. Phys. 161:35-60, section 2.3).
 
     Attributes:
         parameters: of the source.
         motion: how it moves; None if it stays.
         target_density, target_excess: what cells inside are raised to at full strength [-], [K above the air].
-        cell_count: how many cells outside of static solids lie inside; of a source that moves, in the last step.
+        cell_count: how many cells outside of static solids it covers a part of; if it moves, in the last step.
     """
 
     def __init__(self, parameters: SmokeSourceParameters, *, cell_size: float, ambient_temperature: float) -> None:
@@ -85,26 +92,24 @@ class Source:
         # Random numbers of other seeds are others; seed 0 leaves the key of a patch as it is.
         self._salt = int(np.uint32(spread(parameters.seed)).view(np.int32))
         self.motion: SourceMotion | None = None
+        self._shape = SweptShape(parameters, cell_size)
+        turn, velocity = rotation.from_degrees(parameters.rotation_deg), np.asarray(parameters.velocity or (0.0,) * 3)
+        self._own_velocity = rotation.rotated(rotation.conjugate(turn), velocity)
         if parameters.moves:
-            self._shape = SweptShape(parameters, cell_size)
             self.motion = motion_of(parameters, self._shape.reach)
-            start = np.asarray(parameters.velocity or (0.0, 0.0, 0.0))
-            self._own_velocity = rotation.rotated(
-                rotation.conjugate(rotation.from_degrees(parameters.rotation_deg)), start
-            )
         else:
-            self._region = build_solid(parameters)
+            self._rest = Motion(np.asarray(parameters.position, float), turn, np.zeros(3), np.zeros(3))
 
     def enter(self, grid: SmokeGrid) -> None:
         """Emit into this grid from now on."""
-        self._grid = grid
+        self._grid, self._solid = grid, grid.pad(grid.solid).ravel()
         if self.motion is None:
-            self._stay(self._region)
+            self._cover([self._rest])
 
     def bounds(self, begin_s: float, end_s: float) -> NDArray[np.float64]:
         """Corners of a box around where it is from one time to another [s], as far as that is known [m], (2, 3)."""
         if self.motion is None:
-            return self._region.bounds
+            return self._shape.bounds(self._rest)
         spacing = BOUNDS_SPACING * self._shape.reach
         boxes = np.stack([self._shape.bounds(pose) for pose in self.motion.poses(begin_s, end_s, spacing=spacing)])
         unseen = (end_s - begin_s) * self.motion.speed() if isinstance(self.motion, BodyMotion) else 0.0
@@ -134,7 +139,7 @@ class Source:
         """
         begin_s, end_s = self.parameters.span_of(time_s, time_s + dt)
         if self.motion is not None:
-            self._move(self.motion, begin_s, end_s)
+            self._cover(self.motion.poses(begin_s, end_s, spacing=self._grid.cell_size / POSES_PER_CELL))
         strength = self.parameters.largest_strength(begin_s, end_s) * self._steadiness(end_s)
         blocks = -(-max(1, self._cells.count) // BLOCK)
         if self._emitted.shape[0] < blocks:
@@ -143,23 +148,23 @@ class Source:
         noise = Noise(tick, self._salt, first, self.parameters.fluctuation)
         targets = ti.math.vec2(strength * self.target_density, strength * self.target_excess)
         is_hot, count = self.target_excess >= 0.0, self._cells.count
-        _raise_cells(air, self._cells.indices, count, noise, targets, is_hot, blocks, self._emitted)
+        cells = self._cells.indices, self._cells.shares
+        _raise_cells(air, *cells, count, noise, targets, is_hot, blocks, self._emitted)
         if self.parameters.velocity is not None:
             for faces, openness, velocity in zip(self._faces, air.openness, air.state.velocity, strict=True):
-                _set_faces(faces.indices, faces.values, openness, velocity, faces.count)
+                _set_faces(faces.indices, faces.shares, faces.speeds, openness, velocity, faces.count)
         return float(copied(self._emitted)[:blocks].sum(dtype=np.float64))
 
-    def _stay(self, region: PlacedSolid) -> None:
-        grid = self._grid
-        self._cells.put(_flat_indices(grid, grid.cells_inside(region) & ~grid.solid))
-        if self.parameters.velocity is not None:
-            for axis, speed in enumerate(self.parameters.velocity):
-                inside = grid.faces_inside(region, axis) & (grid.open_area[axis] > 0.0)
-                self._faces[axis].put(_flat_indices(grid, inside), speed)
+    def add_fuel(self, air: Air, fuel: ti.Ndarray, time_s: float, dt: float) -> None:
+        """Bring the fuel of the gas to the source's, in the cells of the `emit` before with the same step."""
+        begin_s, end_s = self.parameters.span_of(time_s, time_s + dt)
+        target = self.parameters.largest_strength(begin_s, end_s) * self._steadiness(end_s) * self.parameters.fuel
+        _raise_fuel(air, self._cells.indices, self._cells.shares, self._cells.count, target, fuel)
 
-    def _move(self, motion: SourceMotion, begin_s: float, end_s: float) -> None:
-        poses = motion.poses(begin_s, end_s, spacing=self._grid.cell_size / POSES_PER_CELL)
-        self._cells.put(self._shape.covered(self._grid, poses, CELLS).indices)
+    def _cover(self, poses: Sequence[Motion]) -> None:
+        swept = self._shape.covered(self._grid, poses, CELLS)
+        is_air = ~self._solid[swept.indices]
+        self._cells.put(swept.indices[is_air], swept.shares[is_air])
         if self.parameters.velocity is None:
             return
         origins = np.stack([pose.position for pose in poses])
@@ -168,7 +173,7 @@ class Source:
         for axis, faces in enumerate(self._faces):
             swept = self._shape.covered(self._grid, poses, axis)
             turning = rotation.cross(spins[swept.poses], swept.places - origins[swept.poses])
-            faces.put(swept.indices, (blown[swept.poses] + turning)[:, axis])
+            faces.put(swept.indices, swept.shares, (blown[swept.poses] + turning)[:, axis])
 
     def _steadiness(self, time_s: float) -> float:
         """What flickering leaves of its strength [-]."""
@@ -180,6 +185,7 @@ class Source:
 def _raise_cells(
     air: Air,
     cells: Integers,
+    shares: Floats,
     count: ti.i32,
     noise: Noise,
     targets: ti.math.vec2,
@@ -195,12 +201,19 @@ def _raise_cells(
             at = cells[n]
             if not is_solid(air.solids, at):
                 before = density[at]
-                after = ti.max(before, targets[0])
+                after = ti.max(before, shares[n] * targets[0])
                 density[at] = after
                 emitted += part_before(air.solids, at) * (after - before)
-                target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * targets[1]
+                target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * shares[n] * targets[1]
                 excess[at] = ti.max(excess[at], target) if ti.static(is_hot) else ti.min(excess[at], target)
         added[block] = emitted
+
+
+@kernel
+def _raise_fuel(air: Air, cells: Integers, shares: Floats, count: ti.i32, target: ti.f32, fuel: Floats):
+    for n in range(count):
+        if not is_solid(air.solids, cells[n]):
+            fuel[cells[n]] = ti.max(fuel[cells[n]], shares[n] * target)
 
 
 @func
@@ -216,10 +229,11 @@ def _fluctuate(box: Grid, at: ti.i32, noise: Noise):
 
 
 @kernel
-def _set_faces(faces: Integers, speeds: Floats, openness: Floats, velocity: Floats, count: ti.i32):
+def _set_faces(faces: Integers, shares: Floats, speeds: Floats, openness: Floats, velocity: Floats, count: ti.i32):
     for n in range(count):
-        if openness[faces[n]] > 0.0:
-            velocity[faces[n]] = speeds[n]
+        at = faces[n]
+        if openness[at] > 0.0:
+            velocity[at] = (1.0 - shares[n]) * velocity[at] + shares[n] * speeds[n]
 
 
 def sources_of(parameters: SmokeParameters) -> Sequence[Source]:
@@ -232,17 +246,11 @@ def require_cells(parameters: SmokeParameters, sources: Sequence[Source], grid: 
     """Look whether all sources of a smoke can emit in its grid.
 
     Raises:
-        ValueError: a source that stays contains no open cell: it lies outside the box, in a solid, or is smaller than
-            a cell.
+        ValueError: a source that stays covers no open cell: it lies outside the box or in a solid.
     """
     for number, source in enumerate(sources):
         if source.motion is None and source.cell_count == 0:
             raise ValueError(
-                f'smoke "{parameters.name}", source {number}: no cell centre lies inside it; move it into the box '
-                f"from {grid.origin} to {grid.upper} m, out of solids, or make it larger than a cell "
-                f"of {grid.cell_size:g} m"
+                f'smoke "{parameters.name}", source {number}: it covers no cell; move it into the box '
+                f"from {grid.origin} to {grid.upper} m, and out of solids"
             )
-
-
-def _flat_indices(grid: SmokeGrid, mask: NDArray[np.bool_]) -> NDArray[np.int32]:
-    return np.flatnonzero(grid.pad(mask)).astype(np.int32)

@@ -27,9 +27,10 @@ from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_floats
+from sim.smoke.combustion import Combustion
 from sim.smoke.cut_cells import CHANGES, KEEPER, LEAST_VOLUME, NEAR_SOLIDS, keeper_of, way
 from sim.smoke.lanes import cell_counts, fill_row, fill_rows, lane_items, lane_place, row_start, steps
-from sim.smoke.obstacles import Air, Solids, flux_part
+from sim.smoke.obstacles import Air, Solids, flux_part, mean_volume
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 
 LEAST_ROOM = 1.0e-3  # of cells beside moving solids that tells a density [cells]
@@ -38,43 +39,51 @@ KEEPS_OFF = 1.0e-6
 
 
 class Transport:
-    """Carries the density and the excess temperature of one grid.
+    """Carries the density and the excess temperature of one grid, and the fuel if there is any.
 
-    What comes in through open sides is clean air at the air's temperature. Cells in solids hold nothing.
+    What comes in through open sides is clean air at the air's temperature. Cells in solids hold nothing. Where gas
+    expands its smoke is spread over more room; heat and fuel are those of the gas, and stay.
 
     Args:
         air: whose state is carried.
         work: six arrays to work in.
         sharpens: whether what the donor cells spread is taken back.
+        combustion: the fuel, and how much gas expands.
     """
 
-    def __init__(self, air: Air, work: tuple[ti.Ndarray, ...], *, sharpens: bool) -> None:
+    def __init__(
+        self, air: Air, work: tuple[ti.Ndarray, ...], *, sharpens: bool, combustion: Combustion | None = None
+    ) -> None:
+        of_gas = [air.state.excess] if combustion is None else [air.state.excess, combustion.fuel]
+        self._carried = [(air.state.density, False), *((values, combustion is not None) for values in of_gas)]
+        self._expansion = new_floats(1) if combustion is None else combustion.expansion
+        self._expands = combustion is not None
         self._air, self._rows, self._sharpens = air, new_rows(air.box), sharpens
         self._spread, self._fluxes, self._kept = work[0], Faces(*work[1:4]), work[4:6]
         solids = air.solids
         self._room = new_floats(solids.volume.shape[0]) if solids.moving else solids.volume
 
     def advance(self, step: float) -> None:
-        """Carry both by a step over the edge of a cell [s/m], in parts in which no cell gives more than it has."""
+        """Carry all by a step over the edge of a cell [s/m], in parts in which no cell gives more than it has."""
         given, _ = _largest_outflow(self._air, step, self._rows)
         parts = max(1, math.ceil(given))
-        for values in (self._air.state.density, self._air.state.excess):
+        for values, grows in self._carried:
             if self._air.solids.moving:
                 _start(self._air, values, self._room)
             for part in range(parts):
-                self._carry(values, step / parts, is_last=part == parts - 1)
+                self._carry(values, step / parts, grows=grows, is_last=part == parts - 1)
 
-    def _carry(self, values: ti.Ndarray, step: float, *, is_last: bool) -> None:
+    def _carry(self, values: ti.Ndarray, step: float, *, grows: bool, is_last: bool) -> None:
         air, spread, fluxes, (leaving, coming) = self._air, self._spread, self._fluxes, self._kept
         volume = self._room
         if air.solids.cuts:
-            _spread(air, values, volume, fluxes.x, step)
+            _spread(air, values, volume, fluxes.x, step, self._expansion, grows)
             if air.solids.moving:
-                _drain(air, self._room, step)
+                _drain(air, self._room, step, self._expansion, self._expands)
                 volume = air.solids.volume if is_last else volume
             _keep(air, fluxes.x, values, self._room, volume, spread)
         else:
-            _spread(air, values, volume, spread, step)
+            _spread(air, values, volume, spread, step, self._expansion, grows)
         if self._sharpens:
             _find_fluxes(air, spread, fluxes, step)
             _limit(air, values, spread, fluxes, volume, leaving, coming, step)
@@ -158,16 +167,18 @@ def _start(air: Air, values: Floats, room: Floats):
 
 
 @kernel
-def _spread(air: Air, values: Floats, room: Floats, spread: Floats, step: ti.f32):
-    """What each cell holds after the walk."""
+def _spread(
+    air: Air, values: Floats, room: Floats, spread: Floats, step: ti.f32, expansion: Floats, grows: ti.template()
+):
+    """What each cell holds after the walk; what grows with the gas is as much more as that expands."""
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
-        given = ti.static((i, j, air, values, room, step))
+        given = ti.static((i, j, air, values, room, step, expansion, grows))
         fill_row(air.box, spread, row_start(air.box, i, j), air.box.nz, lane, _spread_cell, given)
 
 
 @kernel
-def _drain(air: Air, room: Floats, step: ti.f32):
-    """Take what has flowed out of the room of cells beside solids that have moved."""
+def _drain(air: Air, room: Floats, step: ti.f32, expansion: Floats, expands: ti.template()):
+    """Take what has flowed out, but for what has expanded, of the room of cells beside solids that have moved."""
     box, solids = ti.static((air.box, air.solids))
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
         for n in range(lane_items(box, box.nz, lane)):
@@ -176,6 +187,8 @@ def _drain(air: Air, room: Floats, step: ti.f32):
                 lost = 0.0
                 for axis in ti.static(range(3)):
                     lost += _face_flux(air, axis, at + steps(box)[axis]) - _face_flux(air, axis, at)
+                if ti.static(expands):
+                    lost -= mean_volume(solids, at) * expansion[at]
                 room[at] -= step * lost
 
 
@@ -241,7 +254,17 @@ def _sharpen(air: Air, values: Floats, spread: Floats, fluxes: Faces, volume: Fl
 
 
 @func
-def _spread_cell(k: ti.i32, i: ti.i32, j: ti.i32, air: Air, values: Floats, room: Floats, step: ti.f32) -> ti.f32:
+def _spread_cell(
+    k: ti.i32,
+    i: ti.i32,
+    j: ti.i32,
+    air: Air,
+    values: Floats,
+    room: Floats,
+    step: ti.f32,
+    expansion: Floats,
+    grows: ti.template(),
+) -> ti.f32:
     at, here = row_start(air.box, i, j) + k, ti.Vector([i, j, k])
     lost = 0.0
     for axis in ti.static(range(3)):
@@ -249,6 +272,8 @@ def _spread_cell(k: ti.i32, i: ti.i32, j: ti.i32, air: Air, values: Floats, room
         lost += _given(at + along, here[axis] + 1, axis, air, values, step) - _given(
             at, here[axis], axis, air, values, step
         )
+    if ti.static(grows):
+        lost -= step * mean_volume(air.solids, at) * expansion[at] * values[at]
     return _size(air.solids, room, at) * values[at] - lost
 
 

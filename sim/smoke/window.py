@@ -13,8 +13,7 @@ ahead, so that a front that moves does not ask for one in each.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import taichi as ti
@@ -30,9 +29,6 @@ from sim.smoke.lanes import Grid, cell_counts, lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.reductions import Pair, Rows, find_maxima, partial_place
-
-if TYPE_CHECKING:
-    from sim.smoke.arrays import State
 
 Ends = NDArray[np.float64]
 """Lower and upper end along x, y, z, (2, 3); in cells from the lower corner of the smoke's box, or in metres."""
@@ -138,13 +134,17 @@ def _union(first: Ends | None, second: Ends | None) -> Ends | None:
     return np.stack([np.minimum(first[0], second[0]), np.maximum(first[1], second[1])])
 
 
-def carry_over(state: State, old: tuple[SmokeGrid, Grid], into: State, new: tuple[SmokeGrid, Grid]) -> None:
-    """Copy what both windows have; each comes with its grid for kernels."""
+def carry_over(
+    arrays: Mapping[str, ti.Ndarray],
+    old: tuple[SmokeGrid, Grid],
+    into: Mapping[str, ti.Ndarray],
+    new: tuple[SmokeGrid, Grid],
+) -> None:
+    """Copy what both windows have, of faces across x, y, z, which come first, and of cells; each with its grids."""
     (old_grid, old_box), (new_grid, new_box) = old, new
     shift = np.subtract(new_grid.window.first, old_grid.window.first)
-    pairs = [*zip(state.velocity, into.velocity, range(3), strict=True)]
-    pairs += [(state.density, into.density, 3), (state.excess, into.excess, 3)]
-    for source, target, axis in pairs:
+    for axis, (name, source) in enumerate(arrays.items()):
+        target = into[name]
         own = np.arange(3) == axis  # a face more than cells along the own axis
         low = np.maximum(1, 1 + shift)
         high = np.minimum(np.add(old_grid.cells, own), np.add(new_grid.cells, own) + shift)

@@ -28,6 +28,7 @@ TINY = {
         "fluid.water.particle_radius": 0.025,
         "smoke.fog.cell_size": 0.04,
     },
+    "fireball": {"smoke.fire.cell_size": 0.2},
     "flag_in_wind": {"cloth.flag.shape.counts": [13, 9]},
     "floating_bodies": {"fluid.water.particle_radius": 0.025},
     "hammock_of_water": {"cloth.sheet.shape.counts": [13, 13], "fluid.water.emitter.0.start_s": 0.0},

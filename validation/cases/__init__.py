@@ -19,7 +19,7 @@ CASES = (
     "swinging-drop", "viscosity",
     "free-momentum", "coupled-momentum", "rigid-motion", "rigid-contacts", "joints", "pyramid", "inertia",
     "cloth", "cloth-crossings",
-    "smoke-vortices", "smoke-projection", "smoke-solids", "smoke-plume", "smoke-front", "smoke-mass",
+    "smoke-vortices", "smoke-projection", "smoke-solids", "smoke-wake", "smoke-plume", "smoke-front", "smoke-mass",
     "submerged-sphere", "buoyancy", "bunny-energy",
 )  # fmt: skip
 """In the order in which they are computed; each in the module of its name."""

@@ -176,11 +176,11 @@ def _check_keys(material: MaterialParameters, path: KeyPath, findings: Findings)
 
 
 def _check_glow(job: Job, table: KeyPath, name: str, look: str, findings: Findings) -> None:
-    hottest = [source.temperature for smoke in job.smoke if smoke.name == name for source in smoke.source]
+    hottest = [smoke.ambient_temperature + smoke.hottest_excess for smoke in job.smoke if smoke.name == name]
     if hottest and max(hottest) < GLOWING_K:
         findings.warn(
             (*table, "look"),
-            f'is "{look}", but the hottest source has {max(hottest):g} K, and nothing glows below some '
+            f'is "{look}", but its hottest gas has {max(hottest):g} K, and nothing glows below some '
             f"{GLOWING_K:g} K; flames have 1300 K and more",
         )
 

@@ -34,6 +34,8 @@ from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, Sm
 BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 374, 250
 """Upper bounds: 214 for the solver and its couplings, and, where a CPU computes, 159 for the six snapshots and
 checkpoints that the simulation may hold at once; on a GPU these are not in its memory."""
+FIRE_BYTES, FIRE_BYTES_ON_GPU = 36, 8
+"""On top for each cell where fuel burns: fuel and expansion, and fuel in checkpoints."""
 BYTES_PER_ROW_ON_GPU = 5 * 32 * 8
 """On top for each row of cells along z: five reductions (`sim.smoke.reductions`) of 32 lanes, two numbers each."""
 COUNTED_CELLS = 1_000_000
@@ -66,6 +68,7 @@ def check_smokes(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         check_mesh_grids(job, smoke, solids, geometry_of, findings)
         _check_air(job, smoke, index, standing, findings)
         check_closed_domain(job, smoke, solids, findings)
+        _check_fire(smoke, index, findings)
         for number, source in enumerate(smoke.source):
             path: KeyPath = ("smoke", index, "source", number)
             _check_numbers(job, smoke, source, path, findings)
@@ -139,14 +142,14 @@ def _check_size(
             f"use {rounded_down(extent.min() / LEAST_LAYERS):g} m or less",
         )
     layers = np.ceil(extent / smoke.cell_size)
-    cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, on_gpu=budget.on_gpu)
+    cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, smoke, on_gpu=budget.on_gpu)
     cells_before, bytes_before = before
     if smoke.grid != "box":
         # Nobody knows how large its window gets: the job pauses should it outgrow the memory.
         return int(expected_cells(smoke, job.domain)), min(size_bytes, max(0.0, budget.bytes - bytes_before))
     if size_bytes + bytes_before > budget.bytes:
         room = max(0.0, budget.bytes - bytes_before)
-        size = _cell_size_that_fits(extent, smoke.cell_size, room, on_gpu=budget.on_gpu)
+        size = _cell_size_that_fits(extent, smoke, room, on_gpu=budget.on_gpu)
         beside = f" beside the {count(cells_before)} of other smoke" if cells_before else ""
         findings.error(
             ("smoke", index, "cell_size"),
@@ -155,7 +158,9 @@ def _check_size(
             f"at most {count(room // (size_bytes / cells))} fit{beside}: use {rounded_up(size):g} m or more",
         )
     elif cells > MOST_CELLS:
-        size = _cell_size_that_fits(extent, smoke.cell_size, float(MOST_CELLS * BYTES_PER_CELL), on_gpu=False)
+        size = _cell_size_that_fits(
+            extent, smoke, float(MOST_CELLS * _bytes_per_cell(smoke, on_gpu=False)), on_gpu=False
+        )
         findings.error(
             ("smoke", index, "cell_size"),
             f"{count(cells)} cells are more than a smoke may have, {count(MOST_CELLS)}; "
@@ -173,7 +178,7 @@ def _check_first_window(job: Job, index: int, solids: Solids, budget: MemoryBudg
         return
     ends = np.clip([np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]], *smoke.limits(job.domain))
     layers = np.ceil((ends[1] - ends[0]) / smoke.cell_size)
-    size_bytes = _bytes_of(layers, on_gpu=budget.on_gpu)
+    size_bytes = _bytes_of(layers, smoke, on_gpu=budget.on_gpu)
     if size_bytes > budget.bytes:
         findings.error(
             ("smoke", index, "grid"),
@@ -183,11 +188,10 @@ def _check_first_window(job: Job, index: int, solids: Solids, budget: MemoryBudg
         )
 
 
-def _bytes_of(layers: NDArray[np.float64], *, on_gpu: bool) -> float:
+def _bytes_of(layers: NDArray[np.float64], smoke: SmokeParameters, *, on_gpu: bool) -> float:
     """Upper bound of the memory of a box of so many cells along x, y, z."""
-    rows = float(layers[0] * layers[1])
-    cells = float(np.prod(layers))
-    return cells * BYTES_PER_CELL_ON_GPU + rows * BYTES_PER_ROW_ON_GPU if on_gpu else cells * BYTES_PER_CELL
+    rows = float(layers[0] * layers[1]) if on_gpu else 0.0
+    return float(np.prod(layers)) * _bytes_per_cell(smoke, on_gpu=on_gpu) + rows * BYTES_PER_ROW_ON_GPU
 
 
 def growth_refusal(job: Job) -> Callable[[float], str | None]:
@@ -195,18 +199,23 @@ def growth_refusal(job: Job) -> Callable[[float], str | None]:
 
     def refusal(more: float) -> str | None:
         budget = memory_budget(job)
-        each = BYTES_PER_CELL_ON_GPU if budget.on_gpu else BYTES_PER_CELL
+        each = max(_bytes_per_cell(smoke, on_gpu=budget.on_gpu) for smoke in job.smoke)
         return budget.refusal(more, "more", float(each))
 
     return refusal
 
 
-def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: float, *, on_gpu: bool) -> float:
-    """The smallest cell size [m], not below a given one, that cuts a box into cells of so many bytes, or into one."""
-    most = max(1.0, room // (BYTES_PER_CELL_ON_GPU if on_gpu else BYTES_PER_CELL))
-    size = max(cell_size, float(np.cbrt(np.prod(extent) / most)))
+def _bytes_per_cell(smoke: SmokeParameters, *, on_gpu: bool) -> int:
+    of_all, of_fire = (BYTES_PER_CELL_ON_GPU, FIRE_BYTES_ON_GPU) if on_gpu else (BYTES_PER_CELL, FIRE_BYTES)
+    return of_all if smoke.fire is None else of_all + of_fire
+
+
+def _cell_size_that_fits(extent: NDArray[np.float64], smoke: SmokeParameters, room: float, *, on_gpu: bool) -> float:
+    """The smallest cell size [m], not below the smoke's, that cuts a box into cells of so many bytes, or into one."""
+    most = max(1.0, room // _bytes_per_cell(smoke, on_gpu=on_gpu))
+    size = max(smoke.cell_size, float(np.cbrt(np.prod(extent) / most)))
     layers = np.ceil(extent / size)
-    while _bytes_of(layers, on_gpu=on_gpu) > room and layers.max() > 1.0:
+    while _bytes_of(layers, smoke, on_gpu=on_gpu) > room and layers.max() > 1.0:
         # Counts are rounded up: the next size of use is the one that saves a layer of cells.
         size = float(np.min(extent[layers > 1.0] / (layers[layers > 1.0] - 1.0))) * (1.0 + 1.0e-9)
         layers = np.ceil(extent / size)
@@ -289,13 +298,26 @@ def _check_numbers(
         findings.warn((*path, "temperature"), f"{kelvin:g} K is hotter than any flame; wood burns at 1500 K")
     elif kelvin < COLDEST_AIR:
         findings.warn((*path, "temperature"), f"{kelvin:g} K is colder than any air; 20 °C are 293 K")
-    is_empty = source.density == 0.0 and kelvin == smoke.ambient_temperature
+    is_empty = source.density == 0.0 and source.fuel == 0.0 and kelvin == smoke.ambient_temperature
     if is_empty and source.velocity is None:
         findings.warn(path, "has no density, and the temperature of the air: it emits nothing")
     if not source.emits_during(0.0, job.film_s):
         findings.warn((*path, "start_s"), f"starts at {source.start_s:g} s, after the film's end at {job.film_s:g} s")
     elif source.largest_strength(*source.span_of(0.0, job.film_s)) == 0.0:
         findings.warn((*path, "ramp"), f"is 0 whenever it emits in the film's {job.film_s:g} s: it emits nothing")
+
+
+def _check_fire(smoke: SmokeParameters, index: int, findings: Findings) -> None:
+    if smoke.fire is None:
+        return
+    path: KeyPath = ("smoke", index, "fire")
+    hottest = smoke.ambient_temperature + smoke.hottest_excess
+    if hottest > HOTTEST:
+        findings.error((*path, "heat"), f"makes flames of {hottest:.0f} K, beyond {HOTTEST:g} K, where gas is a plasma")
+    elif hottest > HOTTEST_FLAME:
+        findings.warn((*path, "heat"), f"makes flames of {hottest:.0f} K, hotter than any; wood burns at 1500 K")
+    if smoke.fire.soot == 0.0 and not any(source.density for source in smoke.source):
+        findings.warn((*path, "soot"), "is 0, and no source has a density: nothing is there to glow or to be seen")
 
 
 def _check_following(job: Job, source: SmokeSourceParameters, path: KeyPath, findings: Findings) -> None:

@@ -85,10 +85,14 @@ def test_smoke_is_as_large_as_its_strongest_source():
     wide_and_thin = {**SOURCE, "shape": {"type": "sphere", "radius": 0.2}, "density": 0.1}
     later = {**SOURCE, "shape": {"type": "sphere", "radius": 3.0}, "start_s": 5.0}
     heat = {**SOURCE, "shape": {"type": "sphere", "radius": 1.0}, "density": 0.0}
+    one = job(smoke=[{"name": "plume", "source": [{**SOURCE, "density": 1.0}]}])
     scene = job(smoke=[{"name": "plume", "source": [wide_and_thin, SOURCE, later, heat]}])
     assert size_of_smoke(scene, scene.smoke[0]) == pytest.approx(0.1)
     faint = job(smoke=[{"name": "plume", "source": [{**SOURCE, "ramp": [{"time_s": 0.0, "strength": 0.5}]}]}])
     assert size_of_smoke(faint, faint.smoke[0]) == pytest.approx(0.05)
+    burning = {**SOURCE, "temperature": 700.0, "density": 0.0, "fuel": 0.5}
+    fire = job(smoke=[{"name": "plume", "source": [burning], "fire": {"soot": 0.8}}])
+    assert size_of_smoke(fire, fire.smoke[0]) == pytest.approx(0.4 * size_of_smoke(one, one.smoke[0]))
     nothing = job(smoke=[{"name": "plume", "source": [heat]}])
     assert size_of_smoke(nothing, nothing.smoke[0]) == pytest.approx(2.0)
 

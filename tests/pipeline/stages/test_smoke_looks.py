@@ -49,7 +49,7 @@ position = [0.0, 0.0, 0.7]
         ),
         (
             COLD + 'look = "fire"',
-            'dam.toml:16 material.flames.look: is "fire", but the hottest source has 500 K, and nothing glows below '
+            'dam.toml:16 material.flames.look: is "fire", but its hottest gas has 500 K, and nothing glows below '
             "some 900 K; flames have 1300 K and more",
         ),
     ],

@@ -4,7 +4,7 @@ import math
 
 from smoke_scenes import Bytes
 
-from pipeline.kinds.checks.smoke import BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU
+from pipeline.kinds.checks.smoke import BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU, FIRE_BYTES, FIRE_BYTES_ON_GPU
 from pipeline.kinds.smoke import SMOKE
 from pipeline.model.job import Job
 from pipeline.stages import simulate
@@ -20,7 +20,10 @@ JOB = {
             **{"name": "fog", "cell_size": 1.0 / CELLS, "min": (-0.5, -0.5, 0.0), "max": (0.5, 0.5, 1.0)},
             # The smallest eddies take the most.
             "turbulence": {"strength": 1.0, "size": 2.0 / CELLS},
-            "source": [{"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.2)}],
+            "source": [
+                {"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.2), "temperature": 700, "fuel": 1}
+            ],
+            "fire": {},
         }
     ],
     "rigid": [
@@ -54,8 +57,8 @@ def test_check_counts_all_that_smoke_with_everything_in_it_takes(monkeypatch):
     solver = made.total / cells
     # Counted alone: the couplings to a fluid and to cloth, of 32 and 24 bytes, are there.
     assert solver > 140.0
-    assert solver <= BYTES_PER_CELL_ON_GPU
+    assert solver <= BYTES_PER_CELL_ON_GPU + FIRE_BYTES_ON_GPU
     snapshot = sum(array.nbytes for array in world.snapshots()["fog"].arrays.values())
     checkpoint = sum(array.nbytes for name, array in world.checkpoint().items() if math.prod(array.shape) >= cells)
     assert max(snapshot, checkpoint) <= SMOKE.snapshot_bytes[0] * cells
-    assert solver + simulate.SNAPSHOTS_AT_ONCE * SMOKE.snapshot_bytes[0] <= BYTES_PER_CELL
+    assert solver + simulate.SNAPSHOTS_AT_ONCE * SMOKE.snapshot_bytes[0] <= BYTES_PER_CELL + FIRE_BYTES

@@ -87,9 +87,12 @@ def test_a_plume_leaves_through_an_open_top_as_it_rises_in_a_taller_box():
     for height in (1.0, 1.75):
         hot = {"shape": {"type": "sphere", "radius": 0.15}, "position": (0.5, 0.5, 0.25), "temperature": 393.0}
         solver = build((1.0, 1.0, height), open_faces=OPEN_BOX, source=[{**hot, "fluctuation": 0.0}])
-        advance(solver, 1.2, 1 / 48)
-        arrays = solver.snapshots()["fog"].arrays
-        # Four to two cells below the top of the lower box.
-        rising = (arrays["density"] * arrays["velocity"][..., 2])[:, :, 12:14]
-        fluxes.append(float(rising.sum(dtype=np.float64)))
-    assert fluxes[0] == pytest.approx(fluxes[1], rel=0.1)
+        rising = 0.0
+        for _ in range(16):
+            advance(solver, 0.1, 1 / 48)
+            arrays = solver.snapshots()["fog"].arrays
+            # Four to two cells below the top of the lower box.
+            rising += float((arrays["density"] * arrays["velocity"][..., 2])[:, :, 12:14].sum(dtype=np.float64))
+        fluxes.append(rising)
+    # In all: at a moment the two differ by up to 15 %, as the head of the plume comes by a little earlier or later.
+    assert fluxes[0] == pytest.approx(fluxes[1], rel=0.03)

@@ -34,6 +34,11 @@ def with_keys(keys: str, source: str = SOURCE) -> str:
     return HEAD + SMOKE + keys + "\n" + source
 
 
+def burning(fire: str, source: str = "fuel = 1.0") -> str:
+    """A job whose source gives fuel that burns with these keys."""
+    return FIRE + f"temperature = 700.0\n{source}\n\n[smoke.fire]\n{fire}\n"
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -52,6 +57,7 @@ def with_keys(keys: str, source: str = SOURCE) -> str:
             HEAD + SMOKE + PATH.replace("[0.0, 0.0, 0.5]", "[-1.0, 0.0, 0.5]"),
             "8 smoke[0].source[0]: never comes ... x -2.346..-0.6536 y -0.3464..0.3464 z 0.1536..0.8464 m, not x -0.5",
         ),
+        (burning("heat = 20000.0"), "15 smoke[0].fire.heat: makes flames of 20700 K, beyond 10000 K"),
         (with_keys("wind = [0.0, 0.0, 2.0]"), '7 smoke[0].wind: ... "z-", which is closed; add it to open_faces'),
         (
             with_keys('wind = [2.0, 0.0, 0.0]\nopen_faces = ["x-"]'),
@@ -77,6 +83,11 @@ def test_smoke_that_cannot_be_is_refused_at_its_place(text, expected, tmp_path):
         (FIRE + "temperature = 60\n", "11 smoke[0].source[0].temperature: 60 K is colder than any air"),
         (with_keys("ambient_temperature = 20"), "7 smoke[0].ambient_temperature: 20 K is no air; 20 °C are 293 K"),
         (FIRE + "temperature = 293\ndensity = 0.0\n", "8 smoke[0].source[0]: has no density ... emits nothing"),
+        (burning("heat = 5000.0"), "15 smoke[0].fire.heat: makes flames of 5700 K, hotter than any"),
+        (
+            burning("soot = 0.0", "fuel = 1.0\ndensity = 0.0"),
+            "16 smoke[0].fire.soot: is 0, and no source has a density",
+        ),
         (FIRE + "ramp = [{ time_s = 1.0, strength = 0.0 }]\n", "11 smoke[0].source[0].ramp: is 0 ... film's 1 s"),
         (
             # It grows after the film of 1 s only.
