@@ -29,7 +29,8 @@ CELLS_A_STEP = 1.6  # of the wind
 
 def find(_: str, cells: Sequence[int], duration: float) -> Found:
     """Wakes with so many cells across the cylinder, for a time [s]."""
-    checks, series = [], {"cells": list(cells)}
+    checks: list[Check] = []
+    series: dict[str, Any] = {"cells": list(cells)}
     for n in cells:
         times, across = _wake(n, duration)
         strouhal, spread = _frequency(times, across)
