@@ -247,9 +247,9 @@ class SmokeSolver:
         if self._fitting.follows:
             frame = time_s, time_s + self._frame_s
             emitting = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
-            self._move_window(
-                self._fitting.next(self.air, self.grid.window, self._outside.velocity, emitting, self._rows)
-            )
+            fuel = None if self._combustion is None else self._combustion.fuel
+            given = self.grid.window, self._outside.velocity, emitting, self._rows
+            self._move_window(self._fitting.next(self.air, fuel, *given))
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Density, temperature and velocity at cell centres; solid cells hold no smoke."""

@@ -1,10 +1,10 @@
 """The window: the part of a smoke's box that is computed, a box of cells around where there is something.
 
 A smoke whose grid follows is fitted at the start of frames. What has to be in the window is called *busy*: cells with
-smoke or heat, and air that moves against the wind, unless all air is stirred; sources that emit; and where the air's
-own velocity takes all this within the frame. Around it lie `MARGIN` cells, and ends lie on blocks of `BLOCK` cells,
-counted from the lower corner of the smoke's box. Where the window ends, and the box does not, its sides are open to air
-as it is outside (`sim.smoke.sides`): at rest, or with the wind.
+smoke, heat or fuel, and air that moves against the wind, unless all air is stirred; sources that emit; and where the
+air's own velocity takes all this within the frame. Around it lie `MARGIN` cells, and ends lie on blocks of `BLOCK`
+cells, counted from the lower corner of the smoke's box. Where the window ends, and the box does not, its sides are open
+to air as it is outside (`sim.smoke.sides`): at rest, or with the wind.
 
 The window is left as it is while the next frame fits and it is not much too large; a new one is fitted to some frames
 ahead, so that a front that moves does not ask for one in each.
@@ -69,7 +69,9 @@ class Fitting:
         ends = self._in_cells(sources)
         return None if ends is None or not self.follows else self._fitted(ends)
 
-    def next(self, air: Air, window: Window, wind: Vector3, sources: Iterable[Ends], rows: Rows) -> Window:
+    def next(
+        self, air: Air, fuel: ti.Ndarray | None, window: Window, wind: Vector3, sources: Iterable[Ends], rows: Rows
+    ) -> Window:
         """The window of the coming frame: the present one, unless that is too small or much too large.
 
         Air outside has the velocity of a wind [m/s]. Sources are those that emit in the frame, each between the corners
@@ -77,7 +79,9 @@ class Fitting:
         anything else is left, the middle of the window is.
         """
         emitting = self._in_cells(sources)
-        soon, later = (_union(emitting, self._busy(air, window, wind, frames, rows)) for frames in (1.0, FRAMES_AHEAD))
+        soon, later = (
+            _union(emitting, self._busy(air, fuel, window, wind, frames, rows)) for frames in (1.0, FRAMES_AHEAD)
+        )
         low, high = np.asarray(window.first), np.asarray(window.first) + window.cells
         nothing = np.stack([0.5 * (low + high)] * 2)
         fitted = self._fitted(nothing if later is None else later)
@@ -92,15 +96,18 @@ class Fitting:
             ends = _union(ends, (np.asarray(box) - self._corner) / self._parameters.cell_size)
         return ends
 
-    def _busy(self, air: Air, window: Window, outside: Vector3, frames: float, rows: Rows) -> Ends | None:
+    def _busy(
+        self, air: Air, fuel: ti.Ndarray | None, window: Window, outside: Vector3, frames: float, rows: Rows
+    ) -> Ends | None:
         """Where what is in a window will be busy in so many frames."""
         wind, step = ti.math.vec3(outside), self._frame_s / self._parameters.cell_size
         least = np.inf
         if self._counts_motion:
             least = max(LEAST_MOTION * _find_motion(air, wind, rows)[0], CREEP / step)
+        gas = air.state.density if fuel is None else fuel
         ends = np.zeros((2, 3))
         for axis in range(3):
-            down, up = _find_ends(axis, air, wind, least, frames * step, rows)
+            down, up = _find_ends(axis, air, gas, wind, least, frames * step, rows)
             if up == 0.0:
                 return None
             ends[:, axis] = window.first[axis] + window.cells[axis] - down, window.first[axis] + up
@@ -184,7 +191,9 @@ def _find_motion(air: Air, wind: ti.math.vec3, rows: Rows) -> Pair:
 
 
 @kernel
-def _find_ends(axis: ti.template(), air: Air, wind: ti.math.vec3, least: ti.f32, step: ti.f32, rows: Rows) -> Pair:
+def _find_ends(
+    axis: ti.template(), air: Air, fuel: Floats, wind: ti.math.vec3, least: ti.f32, step: ti.f32, rows: Rows
+) -> Pair:
     """How far below the upper side of the window, and above its lower side, what is busy reaches, or will [cells].
 
     It goes with the air for a step over the edge of a cell [s/m]. Nothing is busy where the second number is 0.
@@ -196,7 +205,7 @@ def _find_ends(axis: ti.template(), air: Air, wind: ti.math.vec3, least: ti.f32,
             k = lane_place(box, n, lane)
             at = row_start(box, i, j) + k
             velocity = _velocity(air, at)
-            is_busy = state.density[at] > LEAST_DENSITY or ti.abs(state.excess[at]) > LEAST_HEAT_K
+            is_busy = ti.max(state.density[at], fuel[at]) > LEAST_DENSITY or ti.abs(state.excess[at]) > LEAST_HEAT_K
             if is_busy or (velocity - wind).norm() > least:
                 place, way = ti.cast(ti.Vector([i, j, k])[axis], ti.f32), step * velocity[axis]
                 down = ti.max(down, ti.cast(cell_counts(box)[axis], ti.f32) - place + 1.0 - ti.min(way, 0.0))

@@ -137,6 +137,17 @@ def test_what_stirs_all_air_alike_does_not_make_a_window_grow(stirs):
     assert np.prod(world.solvers["puff"].grid.cells) < 40_000
 
 
+def test_a_window_follows_fuel_that_has_not_burnt():
+    cold = {**PUFF, "temperature": 293.0, "density": 0.0, "fuel": 0.5}
+    match = {**PUFF, "temperature": 900.0, "start_s": 90.0, "end_s": 91.0}
+    solver = puff("open", source=[cold, match], fire={}, buoyancy_density=0.0)
+    advance(solver, 24)
+    numbers = solver.diagnostics()
+    assert numbers["burnt_fuel"] == 0.0
+    assert solver.grid.first[0] > 12
+    assert numbers["fuel"] > 0.0
+
+
 def test_fresh_air_moves_with_the_wind():
     """Which nothing disturbs, wherever the window is."""
     idle = {**PUFF, "temperature": 293.0, "fluctuation": 0.0}
