@@ -233,7 +233,7 @@ class SweptShape:
 
     def _distances(self, pose: Motion, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distances [m] of positions (n, 3) from the shape in a pose, (n,)."""
-        return self._distance(rotation.rotated(rotation.conjugate(pose.orientation), places - pose.position))
+        return self._distance((places - pose.position) @ rotation.matrices(pose.orientation))
 
     def _ways_to_the_last(self, poses: Sequence[Motion]) -> NDArray[np.float64]:
         """Bound of how far points of the shape go from each pose to the last one [m], (n,)."""
