@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
+from sim.fluid.boundary import to_particle
 from sim.fluid.kernels import Discretization, distance, spline, spline_slope, wall_share
 from sim.fluid.particles import Fluid, ParticleSet
 
@@ -53,7 +54,7 @@ def compute_stress(fluid: Fluid, pressure: Floats, wall_share: ti.f32, stress: F
         first += near.fluid_count[i] * near.stride
         for k in range(near.boundary_count[i]):
             b = near.indices[first + k * near.stride]
-            q = distance((x_i - samples.position[b]).norm_sqr()) * fluid.inverse_support
+            q = distance(to_particle(samples, b, x_i).norm_sqr()) * fluid.inverse_support
             boundary_sum += samples.volume[b] * q * spline_slope(q)
         total = 0.5 * fluid.volume * fluid_sum + wall_share * pressure_i * boundary_sum
         stress[i] = -fluid.sigma / 3.0 * total

@@ -21,7 +21,7 @@ from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced_tree
 from sim.fluid.body_forces import Summed, sum_over_bodies
 from sim.fluid.body_response import SolveError, error_left, weigh_errors
-from sim.fluid.boundary import WRENCH_WIDTH, Bodies, NearParticles
+from sim.fluid.boundary import WRENCH_WIDTH, Bodies, NearParticles, to_particle
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.kernels import distance, evaluate_slope, inverse_distance, lattice_offsets, spline, spline_slope
 from sim.fluid.particles import Fluid
@@ -301,7 +301,7 @@ def density_rate(fluid: Fluid, i: ti.i32, velocity: Vectors, boundary_velocity: 
     first += near.fluid_count[i] * near.stride
     for k in range(near.boundary_count[i]):
         b = near.indices[first + k * near.stride]
-        x_ib = x_i - samples.position[b]
+        x_ib = to_particle(samples, b, x_i)
         v_ib = v_i
         if ti.static(samples.with_moving):
             v_ib -= boundary_velocity[b]
@@ -353,7 +353,7 @@ def compute_density_and_alpha(fluid: Fluid, least_diagonal: ti.f32, inverse_diag
         first += near.fluid_count[i] * near.stride
         for k in range(near.boundary_count[i]):
             b = near.indices[first + k * near.stride]
-            x_ib = x_i - samples.position[b]
+            x_ib = to_particle(samples, b, x_i)
             r_squared = x_ib.norm_sqr()
             boundary_sum += samples.volume[b] * spline(distance(r_squared) * fluid.inverse_support)
             boundary_gradient += samples.volume[b] * slope_over_distance(r_squared, fluid.inverse_support) * x_ib
@@ -401,7 +401,7 @@ def accelerate_by_pressure(fluid: Fluid, pressure: Floats, acceleration: Vectors
             first += near.fluid_count[i] * near.stride
             for k in range(near.boundary_count[i]):
                 b = near.indices[first + k * near.stride]
-                x_ib = x_i - samples.position[b]
+                x_ib = to_particle(samples, b, x_i)
                 boundary_sum += samples.volume[b] * slope_over_distance(x_ib.norm_sqr(), fluid.inverse_support) * x_ib
         acceleration[i] = (
             -fluid.sigma

@@ -57,18 +57,6 @@ def _falls_onto(opening: Opening, box: Box, gravity: NDArray[np.float64], down: 
     return bool(within.all())
 
 
-def note_gaps(job: Job, path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
-    """Note how far fluids stand off a cloth, which shows beside walls, which they touch."""
-    for fluid in job.fluid:
-        findings.facts.append(
-            Problem(
-                path,
-                f'"{fluid.name}" keeps {fluid.kept_off_sheets:.2g} m off "{cloth.name}" on either side, '
-                f"{fluid.kept_off_sheets / fluid.particle_radius:.2g} of its particle_radius",
-            )
-        )
-
-
 def check_buoyancy(job: Job, path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
     """Warn of loose cloth that weighs so nearly what it displaces that whether it sinks is not known."""
     if any(pin.release_s is None for pin in cloth.pin) or not any(job.gravity):
