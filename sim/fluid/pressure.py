@@ -23,7 +23,15 @@ from sim.fluid.body_forces import Summed, sum_over_bodies
 from sim.fluid.body_response import SolveError, error_left, weigh_errors
 from sim.fluid.boundary import WRENCH_WIDTH, Bodies, NearParticles, to_particle
 from sim.fluid.fluid import SPHFluid
-from sim.fluid.kernels import distance, evaluate_slope, inverse_distance, lattice_offsets, spline, spline_slope
+from sim.fluid.kernels import (
+    distance,
+    evaluate_slope,
+    inverse_distance,
+    lattice_offsets,
+    slope_over_distance,
+    spline,
+    spline_slope,
+)
 from sim.fluid.particles import Fluid
 from sim.fluid.stepping import SolveRecord
 from sim.fluid.tank import FluidStart
@@ -277,13 +285,6 @@ def momentum(iteration: int) -> float:
     """
     k = iteration + 7.0
     return (k - 1.0) / (k + 2.0)
-
-
-@func
-def slope_over_distance(r_squared: ti.f32, inverse_support: ti.f32) -> ti.f32:
-    """Factor on (sigma/h) x_ij of grad W_ij; times x_ij it is 0 where two particles coincide."""
-    inverse = inverse_distance(r_squared)
-    return spline_slope(r_squared * inverse * inverse_support) * inverse
 
 
 @func

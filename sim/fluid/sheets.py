@@ -27,7 +27,6 @@ from sim.fluid.kernels import (
     particle_volume,
     spline,
     spline_slope,
-    wall_calibration,
 )
 from sim.fluid.particles import Fluid
 from sim.fluid.stepping import Box

@@ -10,7 +10,7 @@ from pipeline.kinds.checks.fluid import openings_of
 from pipeline.model.boxes import Box
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings, Problem
+from pipeline.model.problems import Findings
 from sim.cloth.parameters import ClothParameters
 from sim.fluid.opening import Opening
 from sim.fluid.traits import TRAITS

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from checked_jobs import checked, says
+from checked_jobs import says
 from cloth_jobs import BALL, SHEET, errors, warnings
 
 from pipeline.base.errors import JobFileError
