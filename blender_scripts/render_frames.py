@@ -275,7 +275,6 @@ class SceneRenderer:
                 floor_z=self._floor_z,
                 touchables=touchables,
                 dips=dips,
-                off_sheets=description.get("off_cloth") or 0.0,
             )
             yield description, blender_object, mesh, wetness
 

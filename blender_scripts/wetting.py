@@ -101,7 +101,6 @@ def wetted(
     floor_z: float,
     touchables: Sequence[Touchable],
     dips: bool = False,
-    off_sheets: float = 0.0,
 ) -> tuple[SurfaceMesh, np.ndarray]:
     """A fluid's surface, and how far each vertex touches the floor or a solid: 1 where it does, 0 where it is free.
 
@@ -112,7 +111,6 @@ def wetted(
         floor_z: height of the floor [m].
         touchables: bodies, cloths and other fluids.
         dips: move what touches a body or the floor into it.
-        off_sheets: how much farther from a sheet it is where it touches that [m].
     """
     assert mesh.normals is not None
     height = mesh.vertices[:, 2] - floor_z
@@ -121,7 +119,7 @@ def wetted(
     touch.add(np.arange(len(height)), np.maximum(height, 0.0), down, -mesh.normals[:, 2], moves=True)
     for touchable in touchables:
         if touchable.tree is not None:
-            _add(touch, touchable, mesh, off_sheets if touchable.outwards is None else 0.0)
+            _add(touch, touchable, mesh)
     if dips:
         mesh = replace(mesh, vertices=(mesh.vertices + touch.moves).astype(np.float32))
     return mesh, touch.wet.astype(np.float32)
@@ -197,11 +195,10 @@ class _Touch:
         self.moves[numbers[more]] = depth[more, None] * inwards[more]
 
 
-def _add(touch: _Touch, touchable: Touchable, mesh: SurfaceMesh, off: float) -> None:
-    """Take a body, a cloth or a fluid into account, for the vertices near it, which touch it so far off [m]."""
-    farthest = off + _FREE_BEYOND * touch.reach
+def _add(touch: _Touch, touchable: Touchable, mesh: SurfaceMesh) -> None:
+    """Take a body, a cloth or a fluid into account, for the vertices near it."""
     own = (mesh.vertices - touchable.position) @ touchable.rotation
-    numbers, places, triangles = _nearest(touchable, own, farthest)
+    numbers, places, triangles = _nearest(touchable, own, _FREE_BEYOND * touch.reach)
     if not len(numbers):
         return
     way = places - own[numbers]
@@ -218,7 +215,7 @@ def _add(touch: _Touch, touchable: Touchable, mesh: SurfaceMesh, off: float) -> 
         inwards = towards
     inwards = inwards @ touchable.rotation.T
     facing = (mesh.normals[numbers] * inwards).sum(axis=1)
-    touch.add(numbers, np.maximum(distance - off, 0.0), inwards, facing, moves=touchable.can_be_entered)
+    touch.add(numbers, distance, inwards, facing, moves=touchable.can_be_entered)
 
 
 def _smoothstep(values: np.ndarray, low: float, high: float) -> np.ndarray:

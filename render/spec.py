@@ -79,9 +79,6 @@ class MeshSequenceObject(Parameters):
         gt=0.0,
         description="A fluid: how near its surface comes to the floor, bodies and cloths where it touches them [m].",
     )
-    off_cloth: float | None = Field(
-        default=None, gt=0.0, description="A fluid with cloth: how much farther it is from that where it touches [m]."
-    )
     edges: Vector3 | None = Field(default=None, description="A cloth: of the box around it at rest [m].")
 
 

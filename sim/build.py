@@ -25,7 +25,7 @@ from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
 from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.emitter import Carrier
-from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
+from sim.fluid.filling import fill_fluids, particle_capacity
 from sim.fluid.kernels import Discretization
 from sim.fluid.opening import Opening, openings_of
 from sim.fluid.opening_conflicts import opening_problem
@@ -148,7 +148,7 @@ def _build_fluids(
     fluids = with_emitters_on(scene.fluid, scene.rigid)
     followed = {body.name: body for body in movers}
     _check_openings(fluids, scene, solids, followed, spacing, volume)
-    filling = fill_fluids(fluids, scene.domain, solids, NO_POINTS if cloth is None else cloth.start)
+    filling = fill_fluids(fluids, scene.domain, solids, None if cloth is None else (cloth.start, cloth.normals))
     speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]
     speeds += [] if cloth is None else [expected_cloth_speed(scene.cloth, cloth.start, scene.domain, scene.gravity)]
     samples = [

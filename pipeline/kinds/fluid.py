@@ -86,7 +86,6 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
         file=SURFACE.file_of(fluid.name),
         material=material,
         wets_within=WETS_WITHIN_RADII * fluid.particle_radius if sees else None,
-        off_cloth=fluid.kept_off_sheets if job.cloth else None,
     )
     yield PointSequenceObject(
         name=f"{fluid.name}.drops",

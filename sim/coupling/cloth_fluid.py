@@ -20,9 +20,10 @@ from sim.fluid.boundary import Samples, Sheets
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS
-from sim.fluid.sheets import SheetSamples, kept_away, sheet_factor
+from sim.fluid.sheets import SheetSamples, kept_away, sheet_depth, volume_per_area
 
 MAXIMA = 3
+TINY_AREA = 1.0e-20  # keeps the normal of a triangle without area finite [m²]
 LONGEST_EDGE = 1.5  # of the part of a triangle that a sample stands for [spacings]
 
 Corners = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
@@ -36,6 +37,7 @@ class ClothSamples:
     nodes: NDArray[np.int32]  # corners of the triangle of each sample, numbered as the cloth solver does, (m, 3)
     weights: NDArray[np.float64]  # its barycentric coordinates there, at least 0, of sum 1, (m, 3)
     start: NDArray[np.float64]  # where the samples are at the start [m], (m, 3)
+    normals: NDArray[np.float64]  # of their triangles then, of length 1, (m, 3)
 
     @classmethod
     def of(cls, cloth: ClothSolver, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> "ClothSamples":
@@ -46,22 +48,24 @@ class ClothSamples:
         """
         margin = kept_away(support_in_spacings) * spacing
         rest, mass, missing, nodes, weights = [], [], [], [], []
+        felt_per_area = volume_per_area(support_in_spacings) * spacing
         for each, first in zip(cloth.parameters, cloth.state.host.first_node[:-1], strict=True):
             sheet = build_sheet(each.shape)
             triangle, places = _points_of(sheet, spacing)
             share = 1.0 / np.bincount(triangle)[triangle]
             area = share * triangle_areas(sheet.vertices, sheet.triangles)[triangle]
-            rim = 0.5 * np.pi * margin**2 * _rim_lengths(sheet)[triangle] * share
-            rest.append(np.einsum("mc,mcx->mx", places, sheet.vertices[sheet.triangles[triangle]]))
+            points = np.einsum("mc,mcx->mx", places, sheet.vertices[sheet.triangles[triangle]])
+            rest.append(BoundarySamples.of_points(points, known=felt_per_area * area))
             mass.append(area * each.mass_per_area)
-            missing.append(area * (2.0 * margin - each.thickness) + rim)
+            missing.append(area * (2.0 * margin - each.thickness))
             nodes.append(sheet.triangles[triangle] + first)
             weights.append(places)
-        boundary = BoundarySamples.of_bodies(*rest).scaled(sheet_factor(support_in_spacings))
-        sheets = SheetSamples(boundary, np.concatenate(mass), np.concatenate(missing))
+        sheets = SheetSamples(BoundarySamples.of_bodies(*rest), *map(np.concatenate, (mass, missing)))
         all_nodes, all_weights = np.concatenate(nodes).astype(np.int32), np.concatenate(weights)
-        start = np.einsum("mc,mcx->mx", all_weights, cloth.state.host.position[all_nodes])
-        return cls(sheets, all_nodes, all_weights, start)
+        corners = cloth.state.host.position[all_nodes].astype(np.float64)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return cls(sheets, all_nodes, all_weights, np.einsum("mc,mcx->mx", all_weights, corners), normals)
 
 
 def _points_of(sheet: RestSheet, spacing: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -85,17 +89,6 @@ def _parts(count: int) -> NDArray[np.float64]:
     inverted = np.stack([i, j], axis=1)[i + j < count - 1] + 2.0 / 3.0
     two = np.concatenate([upright, inverted]) / count
     return np.concatenate([two, 1.0 - two.sum(axis=1, keepdims=True)], axis=1)
-
-
-def _rim_lengths(sheet: RestSheet) -> NDArray[np.float64]:
-    """Length of the sides of each triangle that are the sheet's rim [m], (k,)."""
-    sides = np.stack([sheet.triangles, np.roll(sheet.triangles, -1, axis=1)], axis=2)
-    _, inverse, counts = np.unique(
-        np.sort(sides.reshape(-1, 2), axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    lengths = np.linalg.norm(sheet.vertices[sides[..., 0]] - sheet.vertices[sides[..., 1]], axis=2)
-    rim: NDArray[np.float64] = (lengths * (counts[inverse].reshape(lengths.shape) == 1)).sum(axis=1)
-    return rim
 
 
 @bundle
@@ -155,6 +148,8 @@ class ClothFluidCoupling(Coupling):
         self._fluid, self._cloth, self._sheets = fluid, cloth, sheets
         count, node_count = len(samples.nodes), cloth.state.vertex_count
         self._samples = SampleNodes(on_device(samples.nodes), on_device(samples.weights))
+        d = fluid.discretization
+        self._depth = sheet_depth(d.support_in_spacings) * d.spacing
         order = np.argsort(samples.nodes.ravel(), kind="stable")
         start = np.searchsorted(samples.nodes.ravel()[order], np.arange(node_count + 1))
         self._entries = Entries(on_device(start), on_device(order))
@@ -185,7 +180,7 @@ class ClothFluidCoupling(Coupling):
         change, distance, speed = (math.sqrt(value) for value in self._reduction.unpack(results)[:MAXIMA].tolist())
         if dt > 0.0:
             self._fluid.tank.take_sheet_motion(self._change, change, dt)
-        place_sheets(self._samples, nodes, boundary.samples, boundary.sheets)
+        place_sheets(self._samples, nodes, boundary.samples, boundary.sheets, self._depth)
         self._fluid.tank.sheets_moved(distance, speed, elapsed_s=dt)
 
 
@@ -233,9 +228,13 @@ def measure_sheets(
 
 
 @kernel
-def place_sheets(sample_nodes: SampleNodes, nodes: Nodes, samples: Samples, sheets: Sheets):
-    """Samples where their nodes are, as fast as these."""
+def place_sheets(sample_nodes: SampleNodes, nodes: Nodes, samples: Samples, sheets: Sheets, depth: ti.f32):
+    """Samples where their nodes are, as fast as these, felt at a depth behind their triangles."""
     for s in range(sheets.count):
         x_b = mixed(sample_nodes, s, nodes.position) + mixed(sample_nodes, s, nodes.carry)
         samples.position[sheets.first + s] = x_b
         samples.velocity[sheets.first + s] = mixed(sample_nodes, s, nodes.velocity)
+        n = sample_nodes.nodes[s]
+        first = nodes.position[n[0]]
+        normal = (nodes.position[n[1]] - first).cross(nodes.position[n[2]] - first)
+        samples.behind[sheets.first + s] = depth * normal.normalized(TINY_AREA)

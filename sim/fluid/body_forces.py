@@ -16,7 +16,7 @@ from sim.core.neighbors import GROWTH, ROUNDING_MARGIN
 from sim.core.parameters import Vector3
 from sim.core.scan import scan_in_parallel, scan_scratch_length
 from sim.fluid.body_response import BodyResponse, accelerate, push
-from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples, Sheets
+from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples, Sheets, to_particle
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
 from sim.fluid.particles import Fluid
 from sim.fluid.sheets import SheetForces, SheetReaction, answer_of_sheets, react_of_sheets
@@ -290,11 +290,11 @@ def gather_forces(near: NearParticles, exerted: Exerted, force: Vectors):
     fluid, viscosity = ti.static((exerted.fluid, exerted.viscosity))
     particles, samples = ti.static((fluid.particles, fluid.samples))
     for b in range(near.sample_count):
-        x_b, v_b = samples.position[near.first + b], samples.velocity[near.first + b]
+        v_b = samples.velocity[near.first + b]
         total = ti.math.vec3(0.0)
         for k in range(near.start[b], near.start[b] + near.count[b]):
             i = near.particles[k]
-            x_ib = particles.position[i] - x_b
+            x_ib = to_particle(samples, near.first + b, particles.position[i])
             r_squared = x_ib.norm_sqr()
             r = ti.sqrt(r_squared)
             scale = 0.0

@@ -8,7 +8,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers, Vectors, on_device
-from sim.core.bundles import bundle
+from sim.core.bundles import bundle, func
 from sim.core.cells import CellGrid, CellSort, Grid, SortArrays, SortedPoints, counting_sort
 from sim.core.host_access import put
 from sim.core.launch import kernel
@@ -32,6 +32,8 @@ class Samples(NamedTuple):
     volume: Floats  # V_b [m³], (m,)
     friction_volume: Floats  # V_b as friction counts it [m³], 0 for samples without friction, (m,)
     with_moving: ti.template()  # whether any sample moves
+    behind: Vectors  # normals of sheets, as long as their samples are felt behind them [m]; 0 for all others
+    with_sheets: ti.template()  # whether there are sheets; `behind` is empty without
 
 
 @bundle
@@ -63,6 +65,22 @@ class NearParticles(NamedTuple):
     start: Integers  # (moving + 1,)
     count: Integers  # (moving,)
     particles: Integers  # in the order of the sorted particles
+
+
+@func
+def shift_behind(samples: Samples, b: ti.i32, x_i: ti.math.vec3) -> ti.math.vec3:
+    """From where a particle feels a sample to the sample: those of sheets lie behind them, on whichever side it is."""
+    shift = ti.math.vec3(0.0)
+    if ti.static(samples.with_sheets):
+        behind = samples.behind[b]
+        shift = ti.select((x_i - samples.position[b]).dot(behind) < 0.0, -behind, behind)
+    return shift
+
+
+@func
+def to_particle(samples: Samples, b: ti.i32, x_i: ti.math.vec3) -> ti.math.vec3:
+    """From where a particle feels a sample to the particle [m]."""
+    return x_i - samples.position[b] + shift_behind(samples, b, x_i)
 
 
 class BodyStates(NamedTuple):
@@ -149,6 +167,8 @@ class Boundary:
             volume=on_device(volumes),
             friction_volume=on_device(frictional),
             with_moving=self.moving_count > 0,
+            behind=on_device(np.zeros((self.count if self.sheet_count else 0, 3), dtype=np.float32)),
+            with_sheets=self.sheet_count > 0,
         )
         no_body = np.full(self.sheet_count, NO_BODY, dtype=np.int32)
         self.bodies = Bodies(
@@ -176,7 +196,7 @@ class Boundary:
         self._moving_ids = on_device(np.arange(self.moving_count, dtype=np.int32))
         self._moving_position = ti.Vector.ndarray(3, ti.f32, max(self.moving_count, 1))
         self._moving_points = _sorted_points(moving_positions, self._moving_cells) if self._moving_cells else None
-        self._reference_sheets = on_device(sheets.positions)
+        self._reference_sheets, self._reference_behind = (on_device(sheets.positions) for _ in range(2))
         self.moving_index = on_device(np.zeros(self.moving_count, dtype=np.int32))
 
     @property
@@ -245,7 +265,9 @@ class Boundary:
             own = slice(self.sheets.first, self.count)
             arrays["sheet_position"] = self.samples.position.to_numpy()[own].copy()
             arrays["sheet_velocity"] = self.samples.velocity.to_numpy()[own].copy()
+            arrays["sheet_behind"] = self.samples.behind.to_numpy()[own].copy()
             arrays["reference_sheet_position"] = self._reference_sheets.to_numpy()
+            arrays["reference_sheet_behind"] = self._reference_behind.to_numpy()
         return arrays
 
     def restore_reference(self, arrays: Arrays) -> None:
@@ -257,6 +279,7 @@ class Boundary:
         self._place(arrays["reference_body_states"])
         if self.sheet_count:
             self._put_sheets(self.samples.position, arrays["reference_sheet_position"])
+            self._put_sheets(self.samples.behind, arrays["reference_sheet_behind"])
 
     def restore(self, arrays: Arrays) -> None:
         """Put bodies and sheets where they were at the checkpoint."""
@@ -267,6 +290,7 @@ class Boundary:
         if self.sheet_count:
             self._put_sheets(self.samples.position, arrays["sheet_position"])
             self._put_sheets(self.samples.velocity, arrays["sheet_velocity"])
+            self._put_sheets(self.samples.behind, arrays["sheet_behind"])
 
     def _put_sheets(self, array: ti.Ndarray, rows: NDArray[np.generic]) -> None:
         values = array.to_numpy()
@@ -292,6 +316,7 @@ class Boundary:
             self.sheets,
             self._moving_position,
             self._reference_sheets,
+            self._reference_behind,
             self._moving_ids,
             self._moving_cells.grid.on_device,
             self._moving_cells.arrays,
@@ -356,13 +381,14 @@ def sort_moving_samples(
     sheets: Sheets,
     position: Vectors,
     reference: Vectors,
+    reference_behind: Vectors,
     ids: Integers,
     grid: Grid,
     arrays: SortArrays,
     points: SortedPoints,
     index: Integers,
 ):
-    """Sort the moving samples, wherever they are, and note where those of sheets are.
+    """Sort the moving samples, wherever they are, and note where those of sheets are, and are felt.
 
     Coordinates as they are sorted, and the index of each among all samples.
     """
@@ -370,6 +396,8 @@ def sort_moving_samples(
         position[b] = samples.position[first + b]
     for s in range(sheets.count):
         reference[s] = samples.position[sheets.first + s]
+        if ti.static(samples.with_sheets):
+            reference_behind[s] = samples.behind[sheets.first + s]
     counting_sort(position, ids, count, grid, ti.math.vec3(-FAR), ti.math.vec3(FAR), arrays)
     for k in range(count):
         x_b = position[arrays.order[k]]

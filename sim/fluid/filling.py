@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from sim.shapes.solid import Solid
 
 
-SHEET_PLAY_IN_SPACINGS = 0.05  # how much nearer to a sheet than at rest a block may start, whose lattice lies anywhere
-NO_POINTS = np.empty((0, 3))
+FREE_OF_SHEETS = 0.45  # least distance from a sheet at the start [spacings]: at rest half of one
 FULL_DOMAIN = 1.1  # particles that a domain holds at most over those that fill it at rest; emitters stop there
 
 
@@ -40,12 +39,13 @@ def fill_fluids(
     fluids: Sequence[FluidParameters],
     domain: DomainParameters,
     solids: Sequence[Solid],
-    sheets: NDArray[np.floating] = NO_POINTS,
+    sheets: tuple[NDArray[np.floating], NDArray[np.floating]] | None = None,
 ) -> FluidFilling:
     """Fill the blocks of all fluids with particles of spacing 2r, as many as their volumes hold.
 
     They are clear of walls and solids. What two blocks share belongs to the first, of the first fluid that has it.
-    Fluid keeps its distance from the boundary samples of sheets [m], (m, 3), too.
+    Nor do they lie in sheets, which are given by points on them, at most a spacing from each other [m], and normals
+    there, (m, 3) each.
 
     Raises:
         ShapeError: a block's shape cannot be built.
@@ -60,9 +60,11 @@ def fill_fluids(
             solid = build_solid(block)
             points = pack(solid, spacing, Surroundings.in_domain(domain, solids, filled), np.concatenate(positions))
             filled.append(solid)
-            if len(sheets) and len(points):
-                clearance = _sheet_clearance(fluid.support_in_spacings) * spacing
-                points = points[cKDTree(sheets).query(points)[0] > clearance]
+            if sheets is not None and len(points):
+                places, normals = sheets
+                distance, nearest = cKDTree(places).query(points)
+                height = np.abs(np.einsum("nx,nx->n", points - places[nearest], normals[nearest]))
+                points = points[(height > FREE_OF_SHEETS * spacing) | (distance > spacing)]
             if len(points) == 0:
                 raise ValueError(
                     f'fluid "{fluid.name}" block[{number}] has no particle: '
@@ -73,13 +75,6 @@ def fill_fluids(
             phase.append(np.full(len(points), index, dtype=np.int32))
             dye.append(np.full(len(points), block.dye, dtype=np.float32))
     return FluidFilling(*map(np.concatenate, (positions, velocities, phase, dye)))
-
-
-def _sheet_clearance(support_in_spacings: float) -> float:
-    """Least distance of a fluid's particles from the samples of a sheet at the start [spacings]."""
-    from sim.fluid.kernels import wall_calibration  # loads Taichi, which checks of a job do without
-
-    return wall_calibration(support_in_spacings).standoff_in_spacings - SHEET_PLAY_IN_SPACINGS
 
 
 def particle_capacity(

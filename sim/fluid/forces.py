@@ -14,6 +14,7 @@ from sim.core.launch import kernel
 from sim.fluid.air_drag import AirDrag
 from sim.fluid.body_forces import Exerted
 from sim.fluid.body_friction import BodyFriction
+from sim.fluid.boundary import to_particle
 from sim.fluid.kernels import inverse_distance, spline_slope
 from sim.fluid.particles import Fluid, Particles, Phases
 from sim.fluid.sheets import DENSITY
@@ -259,7 +260,7 @@ def compute_acceleration(
         first += near.fluid_count[i] * near.stride
         for k in range(near.boundary_count[i]):
             b = near.indices[first + k * near.stride]
-            x_ib = x_i - samples.position[b]
+            x_ib = to_particle(samples, b, x_i)
             r_squared = x_ib.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r

@@ -48,6 +48,13 @@ def inverse_distance(r_squared: ti.f32) -> ti.f32:
 
 
 @func
+def slope_over_distance(r_squared: ti.f32, inverse_support: ti.f32) -> ti.f32:
+    """Factor on (sigma/h) x_ij of grad W_ij; times x_ij it is 0 where two particles coincide."""
+    inverse = inverse_distance(r_squared)
+    return spline_slope(r_squared * inverse * inverse_support) * inverse
+
+
+@func
 def distance(r_squared: ti.f32) -> ti.f32:
     """|x| from |x|², in the way that is fastest on the device: a CPU would divide to invert."""
     r = ti.sqrt(r_squared)

@@ -17,7 +17,7 @@ from sim.core.motion.parameters import (
 from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.core.water import CAPILLARY_LENGTH, TENSION_OF_WATER
 from sim.fluid.inflow import Inflow
-from sim.fluid.traits import CFL_NUMBER, KEPT_OFF_SHEETS, TRAITS, VISCOUS_NUMBER
+from sim.fluid.traits import CFL_NUMBER, TRAITS, VISCOUS_NUMBER
 from sim.shapes.parameters import Placement, Shape
 
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
@@ -275,11 +275,6 @@ class FluidParameters(Parameters):
     def spacing(self) -> float:
         """Lattice spacing d = 2r [m]."""
         return 2.0 * self.particle_radius
-
-    @property
-    def kept_off_sheets(self) -> float:
-        """What it keeps off cloth, where it touches walls and bodies [m]."""
-        return KEPT_OFF_SHEETS * self.support_in_spacings * self.spacing
 
     @property
     def lattice_volume(self) -> float:

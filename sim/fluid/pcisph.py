@@ -9,6 +9,7 @@ from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import bundle
 from sim.core.launch import kernel
 from sim.core.solver import Diagnostics
+from sim.fluid.boundary import shift_behind
 from sim.fluid.kernels import distance, spline
 from sim.fluid.particles import Fluid, Particles
 from sim.fluid.pressure import (
@@ -181,10 +182,10 @@ def correct_pressure(
         first += near.fluid_count[i] * near.stride
         for k in range(near.boundary_count[i]):
             b = near.indices[first + k * near.stride]
-            x_b = samples.position[b]
+            x_ib = x_i - samples.position[b] + shift_behind(samples, b, particles.position[i])
             if ti.static(samples.with_moving):
-                x_b += dt * (samples.velocity[b] + dt * boundary_response[b])
-            boundary_sum += samples.volume[b] * spline(distance((x_i - x_b).norm_sqr()) * fluid.inverse_support)
+                x_ib -= dt * (samples.velocity[b] + dt * boundary_response[b])
+            boundary_sum += samples.volume[b] * spline(distance(x_ib.norm_sqr()) * fluid.inverse_support)
         excess = ti.max(particles.density[i] - 1.0, 0.0)
         density = fluid.sigma * (fluid.volume * fluid_sum + boundary_sum)
         left = density - 1.0 - (1.0 - correction.share) * excess

@@ -21,9 +21,17 @@ from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced_tree
 from sim.fluid.body_forces import Summed, sum_over_bodies
 from sim.fluid.body_response import SolveError, error_left, weigh_errors
-from sim.fluid.boundary import WRENCH_WIDTH, Bodies, NearParticles
+from sim.fluid.boundary import WRENCH_WIDTH, Bodies, NearParticles, to_particle
 from sim.fluid.fluid import SPHFluid
-from sim.fluid.kernels import distance, evaluate_slope, inverse_distance, lattice_offsets, spline, spline_slope
+from sim.fluid.kernels import (
+    distance,
+    evaluate_slope,
+    inverse_distance,
+    lattice_offsets,
+    slope_over_distance,
+    spline,
+    spline_slope,
+)
 from sim.fluid.particles import Fluid
 from sim.fluid.stepping import SolveRecord
 from sim.fluid.tank import FluidStart
@@ -280,13 +288,6 @@ def momentum(iteration: int) -> float:
 
 
 @func
-def slope_over_distance(r_squared: ti.f32, inverse_support: ti.f32) -> ti.f32:
-    """Factor on (sigma/h) x_ij of grad W_ij; times x_ij it is 0 where two particles coincide."""
-    inverse = inverse_distance(r_squared)
-    return spline_slope(r_squared * inverse * inverse_support) * inverse
-
-
-@func
 def density_rate(fluid: Fluid, i: ti.i32, velocity: Vectors, boundary_velocity: Vectors) -> ti.f32:
     """(D v)_i; `boundary_velocity` counts where there are moving samples only."""
     particles, near, samples = ti.static((fluid.particles, fluid.near, fluid.samples))
@@ -301,7 +302,7 @@ def density_rate(fluid: Fluid, i: ti.i32, velocity: Vectors, boundary_velocity: 
     first += near.fluid_count[i] * near.stride
     for k in range(near.boundary_count[i]):
         b = near.indices[first + k * near.stride]
-        x_ib = x_i - samples.position[b]
+        x_ib = to_particle(samples, b, x_i)
         v_ib = v_i
         if ti.static(samples.with_moving):
             v_ib -= boundary_velocity[b]
@@ -353,7 +354,7 @@ def compute_density_and_alpha(fluid: Fluid, least_diagonal: ti.f32, inverse_diag
         first += near.fluid_count[i] * near.stride
         for k in range(near.boundary_count[i]):
             b = near.indices[first + k * near.stride]
-            x_ib = x_i - samples.position[b]
+            x_ib = to_particle(samples, b, x_i)
             r_squared = x_ib.norm_sqr()
             boundary_sum += samples.volume[b] * spline(distance(r_squared) * fluid.inverse_support)
             boundary_gradient += samples.volume[b] * slope_over_distance(r_squared, fluid.inverse_support) * x_ib
@@ -401,7 +402,7 @@ def accelerate_by_pressure(fluid: Fluid, pressure: Floats, acceleration: Vectors
             first += near.fluid_count[i] * near.stride
             for k in range(near.boundary_count[i]):
                 b = near.indices[first + k * near.stride]
-                x_ib = x_i - samples.position[b]
+                x_ib = to_particle(samples, b, x_i)
                 boundary_sum += samples.volume[b] * slope_over_distance(x_ib.norm_sqr(), fluid.inverse_support) * x_ib
         acceleration[i] = (
             -fluid.sigma

@@ -1,6 +1,7 @@
 """Sheets in a fluid: what the fluid does to their samples, how these answer, and the fluid that moves along."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.solver import Arrays
-from sim.fluid.boundary import Boundary, NearParticles, Samples, Sheets
+from sim.fluid.boundary import Boundary, NearParticles, Samples, Sheets, to_particle
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.kernels import (
     SUPPORT_IN_SPACINGS,
@@ -26,7 +27,6 @@ from sim.fluid.kernels import (
     particle_volume,
     spline,
     spline_slope,
-    wall_calibration,
 )
 from sim.fluid.particles import Fluid
 from sim.fluid.stepping import Box
@@ -34,7 +34,8 @@ from sim.fluid.stepping import Box
 DIVERGENCE, DENSITY = 0, 1  # solves of a step whose forces last apart: of divergence, of density with all other forces
 STEPS_REMEMBERED = 2  # after which arrays that took turns hold forces of the time alone
 FULL_CONTACT = 0.5  # of the density that samples give to fluid at rest beside them: with it a particle touches in full
-AMID_SAMPLES = 2.5  # density in the middle of a sheet by its samples alone: so far above 1 that nothing gets through
+STANDOFF = 0.5  # distance from a sheet at which the first layer of a fluid is at rest [spacings], as at a wall
+AMID_SAMPLES = 1.5  # density in the middle of a sheet by its samples alone, as in the face of a wall
 
 
 @bundle
@@ -57,11 +58,25 @@ class SheetSamples:
     missing_volume: NDArray[np.float64]
 
 
-def sheet_factor(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
-    """Factor on the volumes of a sheet's samples [-], relative to those of a wall."""
-    wall = wall_calibration(support_in_spacings)
-    amid = wall.volume_in_particles * layer_field(0.0, support_in_spacings)[0]
-    return AMID_SAMPLES / (amid * particle_volume(1.0, support_in_spacings))
+@cache
+def sheet_depth(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """How far behind a sheet, seen from either side, its samples are felt [spacings].
+
+    As deep as a wall's lie at a support of two spacings, 0.95. Of a wider one a single layer there would not keep out
+    what moves alone: farther off its density rises more steeply towards the sheet.
+    """
+
+    def excess(depth: float) -> float:
+        amid, at_rest = (layer_field(distance, support_in_spacings)[0] for distance in (depth, depth + STANDOFF))
+        return amid / at_rest * resting_field(support_in_spacings) - AMID_SAMPLES
+
+    return float(brentq(excess, 0.1, support_in_spacings - STANDOFF - 0.01))
+
+
+def volume_per_area(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Volume of a sheet's samples over its area [spacings] that keeps a lattice of fluid at its distance."""
+    field = layer_field(sheet_depth(support_in_spacings) + STANDOFF, support_in_spacings)[0]
+    return resting_field(support_in_spacings) / field
 
 
 def resting_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
@@ -71,24 +86,25 @@ def resting_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     return particle_volume(1.0, support_in_spacings) * float(evaluate(beyond, support_in_spacings).sum())
 
 
-def sheet_standoff(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
-    """Distance from a sheet at which a lattice of fluid is at rest [spacings]: 1.3 at the usual support."""
-    wall = wall_calibration(support_in_spacings)
-    volume = sheet_factor(support_in_spacings) * wall.volume_in_particles * particle_volume(1.0, support_in_spacings)
-    lacking = resting_field(support_in_spacings)
-    return float(
-        brentq(lambda gap: volume * layer_field(gap, support_in_spacings)[0] - lacking, 0.0, support_in_spacings)
-    )
-
-
 def kept_away(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
-    """Distance from a sheet within which there is no fluid [spacings]: particles fill half a spacing around them."""
-    return sheet_standoff(support_in_spacings) - 0.5
+    """How much farther from a sheet fluid on both sides of it is at rest than on one [spacings].
+
+    What is on one side feels what is on the other, and the sheet as well.
+    """
+    volume, depth = volume_per_area(support_in_spacings), sheet_depth(support_in_spacings)
+
+    def excess(gap: float) -> float:
+        layers = np.arange(2.0 * gap, support_in_spacings)
+        beyond = sum(layer_field(float(distance), support_in_spacings)[0] for distance in layers)
+        own = volume * layer_field(depth + gap, support_in_spacings)[0]
+        return own + particle_volume(1.0, support_in_spacings) * beyond - resting_field(support_in_spacings)
+
+    return float(brentq(excess, STANDOFF, 1.0)) - STANDOFF
 
 
 def one_sided_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     """V sum_i W_ib over the particles of a lattice at rest on one side of a sheet [-]."""
-    gaps = np.arange(sheet_standoff(support_in_spacings), support_in_spacings)
+    gaps = np.arange(STANDOFF, support_in_spacings)
     layers = sum(layer_field(float(gap), support_in_spacings)[0] for gap in gaps)
     return particle_volume(1.0, support_in_spacings) * layers
 
@@ -96,7 +112,7 @@ def one_sided_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
 def one_sided_tilt(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     """Length of the mean unit vector from a sheet to the particles of a lattice at rest on one side, weighted by W."""
     axis = np.arange(-np.ceil(support_in_spacings), np.ceil(support_in_spacings) + 1)
-    gaps = np.arange(sheet_standoff(support_in_spacings), support_in_spacings)
+    gaps = np.arange(STANDOFF, support_in_spacings)
     # As a sample lies anywhere between the particles, and no less often in the middle of four than on one.
     offsets = np.stack(np.meshgrid(axis + 0.25, axis + 0.25, gaps, indexing="ij"), axis=-1).reshape(-1, 3)
     distances = np.linalg.norm(offsets, axis=1)
@@ -279,7 +295,7 @@ def begin_sheet_step(
         for k in range(fluid.near.boundary_count[i]):
             b = fluid.near.indices[first + k * fluid.near.stride]
             if b >= sheets.first:
-                r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+                r = distance(to_particle(fluid.samples, b, x_i).norm_sqr())
                 field += fluid.samples.volume[b] * spline(r * fluid.inverse_support)
         field *= fluid.sigma
         mass_i = fluid.volume * fluid.materials.rest_density[fluid.particles.phase[i]]
@@ -291,7 +307,7 @@ def begin_sheet_step(
         total = 0.0
         for k in range(near.start[m], near.start[m] + near.count[m]):
             i = near.particles[k]
-            r = distance((fluid.particles.position[i] - fluid.samples.position[b]).norm_sqr())
+            r = distance(to_particle(fluid.samples, b, fluid.particles.position[i]).norm_sqr())
             total += contacts.mass[i] * spline(r * fluid.inverse_support)
         mass_b = fluid.sigma * fluid.samples.volume[b] * total
         mass[s] = mass_b
@@ -349,11 +365,11 @@ def add_sheets_to_diagonal(
     What a sample has in it, V_b sum_j |n_jb| / m_b, is its `answer`.
     """
     for s in range(sheets.count):
-        x_b = fluid.samples.position[sheets.first + s]
         m = sheets.skipped + s
         total = 0.0
         for k in range(near.start[m], near.start[m] + near.count[m]):
-            r = distance((fluid.particles.position[near.particles[k]] - x_b).norm_sqr())
+            x_i = fluid.particles.position[near.particles[k]]
+            r = distance(to_particle(fluid.samples, sheets.first + s, x_i).norm_sqr())
             total -= spline_slope(r * fluid.inverse_support)
         v_b = fluid.samples.volume[sheets.first + s]
         answer[s] = gradient_factor * v_b * v_b * total / mass[s]
@@ -364,7 +380,7 @@ def add_sheets_to_diagonal(
         for k in range(fluid.near.boundary_count[i]):
             b = fluid.near.indices[first + k * fluid.near.stride]
             if b >= sheets.first:
-                r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+                r = distance(to_particle(fluid.samples, b, x_i).norm_sqr())
                 bound -= answer[b - sheets.first] * spline_slope(r * fluid.inverse_support)
         inverse = inverse_diagonal[i]
         inverse_diagonal[i] = inverse / (1.0 + weight * gradient_factor * bound * inverse)
@@ -421,7 +437,7 @@ def take_sheet_motion(fluid: Fluid, contacts: Contacts, sheets: Sheets, change: 
             for k in range(fluid.near.boundary_count[i]):
                 b = fluid.near.indices[first + k * fluid.near.stride]
                 if b >= sheets.first:
-                    r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+                    r = distance(to_particle(fluid.samples, b, x_i).norm_sqr())
                     total += fluid.samples.volume[b] * spline(r * fluid.inverse_support) * change[b - sheets.first]
             mass = fluid.volume * fluid.materials.rest_density[fluid.particles.phase[i]]
             dv = fluid.sigma * contacts.mass[i] / mass * total

@@ -11,7 +11,7 @@ from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, LaneReduction, Share, Tree, reduced_tree
-from sim.fluid.boundary import Bodies, NearParticles
+from sim.fluid.boundary import Bodies, NearParticles, to_particle
 from sim.fluid.kernels import (
     Discretization,
     evaluate,
@@ -210,7 +210,7 @@ def compute_gradients(fluid: Fluid, contact: Contact, spacing: ti.f32, gradient:
         first += near.fluid_count[i] * near.stride
         for k in range(near.boundary_count[i]):
             b = near.indices[first + k * near.stride]
-            x_ib = x_i - samples.position[b]
+            x_ib = to_particle(samples, b, x_i)
             r_squared = x_ib.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             q = r_squared * inverse_r * fluid.inverse_support
@@ -257,7 +257,7 @@ def smooth_gradients(fluid: Fluid, gradient: Vectors, contact: Contact, interfac
         first += near.fluid_count[i] * near.stride
         for k in range(near.boundary_count[i]):
             b = near.indices[first + k * near.stride]
-            r_squared = (x_i - samples.position[b]).norm_sqr()
+            r_squared = to_particle(samples, b, x_i).norm_sqr()
             wall_field += samples.volume[b] * spline(r_squared * inverse_distance(r_squared) * fluid.inverse_support)
         total += wall_field / fluid.volume * gradient[i]
         size, size_beyond = total.norm(), beyond.norm()

@@ -69,10 +69,6 @@ TRAITS: Mapping[str, SolverTraits] = {
 }
 """Traits by the name of the solver; the solvers themselves are in `sim.fluid.solvers`."""
 
-KEPT_OFF_SHEETS = 0.403
-"""What fluid at rest keeps off a sheet, where it touches walls, over the support: `sim.fluid.sheets.kept_away` at
-a support of two spacings, for who does not load Taichi. Of wider supports it is up to a tenth more."""
-
 
 def stable_time_step(
     *,

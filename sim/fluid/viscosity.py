@@ -11,6 +11,7 @@ from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
 from sim.fluid.body_friction import BodyFriction, Friction
+from sim.fluid.boundary import to_particle
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
 from sim.fluid.particles import Fluid, Particles, ParticleSet
 from sim.fluid.stepping import SolveRecord
@@ -297,7 +298,7 @@ def start_solve(
         if matrix.wall_friction > 0.0:
             for k in range(near.boundary_count[i]):
                 b = near.indices[first + k * near.stride]
-                x_ib = x_i - samples.position[b]
+                x_ib = to_particle(samples, b, x_i)
                 k_ib = (
                     matrix.factor
                     * samples.friction_volume[b]
@@ -346,7 +347,7 @@ def multiply(matrix: ViscousMatrix, vector: Vectors, boundary_vector: Vectors, p
         if matrix.wall_friction > 0.0:
             for k in range(near.boundary_count[i]):
                 b = near.indices[first + k * near.stride]
-                x_ib = x_i - samples.position[b]
+                x_ib = to_particle(samples, b, x_i)
                 k_ib = samples.friction_volume[b] * friction_coefficient(
                     matrix, x_ib.norm_sqr(), particles.density[i], matrix.wall_friction * mu
                 )

@@ -8,6 +8,7 @@ import taichi as ti
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
 from sim.core.solver import Diagnostics
+from sim.fluid.boundary import to_particle
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.forces import Elastic
 from sim.fluid.kernels import distance, spline
@@ -116,7 +117,7 @@ def compute_density_and_pressure(fluid: Fluid, stiffness: ti.f32, pressure_term:
         first += fluid.near.fluid_count[i] * fluid.near.stride
         for k in range(fluid.near.boundary_count[i]):
             b = fluid.near.indices[first + k * fluid.near.stride]
-            r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+            r = distance(to_particle(fluid.samples, b, x_i).norm_sqr())
             boundary_sum += fluid.samples.volume[b] * spline(r * fluid.inverse_support)
         ratio = fluid.sigma * (fluid.volume * fluid_sum + boundary_sum)
         ratio_3 = ratio * ratio * ratio

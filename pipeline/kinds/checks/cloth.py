@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
-from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over, note_gaps
+from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over
 from pipeline.kinds.checks.cloth_joints import check_joints_of_cloth
 from pipeline.kinds.checks.cloth_start import ClothStart, start_cloths
 from pipeline.kinds.checks.joints import joined_to
@@ -60,7 +60,6 @@ def check_cloths(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         check_pin_speeds(start, job, findings)
         check_pin_load(start, job, fluid_over(job, solids, start.box), findings)
         check_buoyancy(job, start.path, start.cloth, findings)
-        note_gaps(job, start.path, start.cloth, findings)
         check_joints_of_cloth(start, job, findings)
         joined = joined_to(start.cloth, job)
         for path, solid in solids.items():

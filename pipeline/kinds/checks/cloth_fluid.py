@@ -10,7 +10,7 @@ from pipeline.kinds.checks.fluid import openings_of
 from pipeline.model.boxes import Box
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings, Problem
+from pipeline.model.problems import Findings
 from sim.cloth.parameters import ClothParameters
 from sim.fluid.opening import Opening
 from sim.fluid.traits import TRAITS
@@ -55,18 +55,6 @@ def _falls_onto(opening: Opening, box: Box, gravity: NDArray[np.float64], down: 
     within = (point >= box[0]) & (point <= box[1])
     within[down] = True
     return bool(within.all())
-
-
-def note_gaps(job: Job, path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
-    """Note how far fluids stand off a cloth, which shows beside walls, which they touch."""
-    for fluid in job.fluid:
-        findings.facts.append(
-            Problem(
-                path,
-                f'"{fluid.name}" keeps {fluid.kept_off_sheets:.2g} m off "{cloth.name}" on either side, '
-                f"{fluid.kept_off_sheets / fluid.particle_radius:.2g} of its particle_radius",
-            )
-        )
 
 
 def check_buoyancy(job: Job, path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from checked_jobs import checked, says
+from checked_jobs import says
 from cloth_jobs import BALL, SHEET, errors, warnings
 
 from pipeline.base.errors import JobFileError
@@ -272,9 +272,3 @@ def test_loose_cloth_that_weighs_what_it_displaces_is_told_to_go_with_the_water(
     assert told(mass_per_area=1.75) == told(thickness=1.4e-3) == []
     pinned = FINE.replace("COUNT", "9") + EDGE + JET
     assert not [line for line in warnings(pinned, tmp_path) if "displaces" in line]
-
-
-def test_how_far_water_stays_off_cloth_is_told(tmp_path):
-    result = checked(FINE.replace("COUNT", "9") + EDGE + JET, tmp_path / "film.toml")
-    facts = [each.message for each in result.findings.facts if each.path == ("cloth", 0)]
-    assert facts == ['"water" keeps 0.016 m off "sheet" on either side, 1.6 of its particle_radius']

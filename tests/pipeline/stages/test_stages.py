@@ -169,9 +169,6 @@ def test_a_clear_fluid_tells_where_it_touches_solids_and_nothing_else_does():
         drawn = {each.name: each for each in render_spec(tank, LAYOUT).objects}
         assert drawn["water"].wets_within == reach
         assert drawn["flag"].wets_within is None
-        assert drawn["water"].off_cloth == tank.fluid[0].kept_off_sheets
-        assert drawn["flag"].off_cloth is None
-    assert all(each.off_cloth is None for each in render_spec(job(), LAYOUT).objects if each.name == "water")
 
 
 def test_milk_in_a_glass_tells_where_it_touches_it():
