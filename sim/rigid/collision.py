@@ -28,7 +28,6 @@ from sim.shapes.body_geometry import BodyGeometry
 
 STEPS_AHEAD, ROOM = 5.0, 0.05
 """Near pairs are searched for with room for the motion of so many steps, and for a part of their shortest edges."""
-MOST_PUSHES = 16  # bodies that push each other in a row
 LARGEST_WORK = 1 << 25  # numbers that pairs need which a GPU looks at side by side
 MOST_BLOCKS = 1 << 14  # of these pairs
 ANY_BUDGET = 1.0e12  # motion that uses up what any pair has [m]
@@ -167,26 +166,6 @@ class CollisionDetector:
         put(self._bodies.motion, motion)
         if kernels.place_boxes(self._bodies, self._domain, self._outer_on_device) > 0 or self._must_search:
             self._search(poses, motion)
-
-    def with_pushes(self, poses: Poses, motion: Array, mass: Array) -> Array:
-        """How far surfaces may get in the step if heavy bodies push light ones, of masses [kg], (n,), [m], (n + 1,).
-
-        What is hit leaves within the step, and may hit the next: contacts are to be known where it may get to.
-        """
-        from sim.rigid.step_kernels import HEAVIER, hand_on
-
-        is_fast = motion[: len(mass)] > kernels.CONTACT_BAND * self._size[: len(mass)]
-        if not is_fast.any() or mass[is_fast].max() < HEAVIER * mass.min():
-            return motion
-        self.look(poses, motion)
-        reach, heavy, room = motion.copy(), np.minimum(mass, kernels.FAR), np.zeros((len(mass), 2), dtype=np.int64)
-        behind, pairs = heavy.copy(), self._near
-        for _ in range(MOST_PUSHES if self._pairs.size else 0):
-            changed = np.zeros(1, dtype=np.int32)
-            hand_on(len(self._pairs), pairs.pairs, self._bodies, heavy, reach, behind, room, changed)
-            if not changed[0]:
-                break
-        return reach
 
     def contacts(self) -> Contacts:
         """Those found last of active bodies, by pair, in order of the numbers of bodies."""

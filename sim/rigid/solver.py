@@ -249,8 +249,6 @@ class RigidSolver:
         points = None if joints is None else joints.points.state()
         if joints is not None:
             joints.points.push(dt)
-        if isinstance(self._detector, CollisionDetector):
-            reach = self._detector.with_pushes(self._poses_described(), reach, bodies.mass)
         self._detector.find(self._poses_described(), reach, among, time_s)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
         carried = partial(self._carried, time_s=time_s + 0.5 * dt) if self.deforming else None

@@ -1,4 +1,4 @@
-"""How far bodies that are near each other may get in a step, whether that is too far, and whether any may bounce."""
+"""Whether bodies that are near each other may get too far in a step, and whether any that touch may bounce."""
 
 from typing import NamedTuple
 
@@ -6,13 +6,9 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
-from sim.rigid.array_types import LongRows, Numbers, Rows, Vector3, Whole, WholeRows
-from sim.rigid.collision_kernels import CONTACT_BAND, FAR, TRUSTED_MOTION, Bodies, Placed
+from sim.rigid.array_types import Numbers, Rows, Vector3, Whole, WholeRows
+from sim.rigid.collision_kernels import CONTACT_BAND, TRUSTED_MOTION, Bodies, Placed
 from sim.rigid.contact_kernels import row_of
-
-HEAVIER = 2.0
-"""Bodies push those ahead that are lighter by this factor. Equal ones lose half of their speed, and heaps would look
-for more contacts in every step."""
 
 
 @bundle
@@ -85,50 +81,6 @@ def count_fast(
                 relative += apart.norm()
             if time_to(advance, relative, acceleration) < dt and (wall >= 0 or may_meet(one, two, bodies)):
                 fast[0] += 1
-
-
-@kernel_of_host_arrays
-def hand_on(
-    count: ti.i32,
-    pairs: WholeRows,
-    bodies: Bodies,
-    mass: Numbers,
-    motion: Numbers,
-    behind: Numbers,
-    most: LongRows,
-    changed: Whole,
-):
-    """How far the surfaces of the two bodies of each of so many pairs may get if one is pushed by the other.
-
-    A body that hits a lighter one, which sticks to it, shares its momentum. Whole numbers are compared, so that the
-    order of threads does not matter.
-
-    Args:
-        mass: of those that move, however large of those that are led [kg], (n,).
-        motion: how far surfaces may get in the step [m], (b,), and with the push.
-        behind: largest mass that pushes each, its own at first [kg], (n,), and with the push.
-        most: room: both as bits, (n, 2).
-        changed: how many there are that get farther.
-    """
-    for body in range(mass.shape[0]):
-        most[body, 0], most[body, 1] = ti.bit_cast(motion[body], ti.i64), ti.bit_cast(behind[body], ti.i64)
-    for pair in range(count):
-        for side in ti.static(range(2)):
-            one, two = pairs[pair, side], pairs[pair, 1 - side]
-            if pairs[pair, 2] < 0 and ti.max(one, two) < mass.shape[0]:
-                is_heavy = behind[one] >= HEAVIER * mass[two]
-                pushed = motion[one] * behind[one] / (behind[one] + mass[two])
-                if is_heavy and pushed > motion[two] + CONTACT_BAND * bodies.size[two]:
-                    apart = -ti.cast(FAR, ti.f64)
-                    for axis in ti.static(range(3)):
-                        apart = ti.max(apart, bodies.box[one, axis] - bodies.box[two, 3 + axis])
-                        apart = ti.max(apart, bodies.box[two, axis] - bodies.box[one, 3 + axis])
-                    if apart <= motion[one] + motion[two]:
-                        ti.atomic_max(most[two, 0], ti.bit_cast(pushed, ti.i64))
-                        ti.atomic_max(most[two, 1], ti.bit_cast(behind[one], ti.i64))
-                        changed[0] += 1
-    for body in range(mass.shape[0]):
-        motion[body], behind[body] = ti.bit_cast(most[body, 0], ti.f64), ti.bit_cast(most[body, 1], ti.f64)
 
 
 @kernel_of_host_arrays
