@@ -14,6 +14,7 @@ from pipeline.job.loading import load_job
 from pipeline.job.reference import reference, with_reference
 from pipeline.job.schema import job_schema, node_at
 from sim.cloth.materials import MATERIALS
+from sim.soft.materials import Law
 
 
 def properties(schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -66,11 +67,13 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
     examples = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
-    example, many, hammer, vase, led, pouring, joints, forces, cloth, smoke, limits = examples
+    example, many, hammer, vase, led, pouring, joints, forces, cloth, smoke, soft, limits = examples
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")
     assert load_job(tmp_path / "limited.toml").limits_of("render").attempts == 5
+    (tmp_path / "castle.toml").write_text(f'name = "castle"\nframes = 2\n{soft}')
+    assert load_job(tmp_path / "castle.toml").soft[0].row.law == Law.SAND
     (tmp_path / "many.toml").write_text(f'name = "many"\n{many}')
     assert Counter(body.group for body in load_job(tmp_path / "many.toml").rigid) == {
         "brick": 40,
