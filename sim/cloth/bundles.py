@@ -78,9 +78,7 @@ class CellArrays(NamedTuple):
     across: Floats  # c_a of d_v [1/m], (arity s,)
     law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
     cell_of_colour: Integers  # first cell of each colour, and number of cells, (colours + 1,)
-    multiplier: Floats  # of the shear, (s,); rectangles only, as what follows
-    shares: Strains  # see `springs.newmark_shares`, (s,)
-    offset: Floats  # by which these have the shear felt as less, (s,)
+    multiplier: Floats  # of the shear, (s,); rectangles only
 
 
 @bundle
@@ -165,8 +163,6 @@ class ThreadWork(NamedTuple):
     change: Floats  # of the multiplier, as far as known
     factor: Floats  # of the change of the spring before
     is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
-    shares: Strains  # see `springs.newmark_shares`
-    offset: Floats  # by which these have a spring felt as shorter [m]
 
 
 @bundle

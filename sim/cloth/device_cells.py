@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
-from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, offset_of, set_column
+from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, set_column
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import pieces_of
-from sim.cloth.springs import KEPT_BY_SHEARS, newmark_shares
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
@@ -46,14 +45,10 @@ class DeviceCells:
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
         self.is_damped = False
         self.first_colours, cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
-        of_shear = self.count if cells.arity == RECTANGLE else 1
-        multiplier, offset = ti.ndarray(ti.f32, of_shear), ti.ndarray(ti.f32, of_shear)
-        shares = ti.Vector.ndarray(2, ti.f32, of_shear)
+        multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
         self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
         listed = (on_device(each.ravel()) for each in (cells.nodes, cells.along, cells.across))
-        law = ti.Vector.ndarray(4, ti.f32, self.count)
-        self.on_device = CellArrays(*listed, law, cell_of_colour, multiplier, shares, offset)
-        self._resolves = False
+        self.on_device = CellArrays(*listed, ti.Vector.ndarray(4, ti.f32, self.count), cell_of_colour, multiplier)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
@@ -65,18 +60,6 @@ class DeviceCells:
         if self.arity == TRIANGLE:
             nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)
             self.mesh.share.from_numpy((weight / np.bincount(nodes, weights=weight)[nodes]).astype(np.float32))
-
-    def resolve_waves(self, resolved: NDArray[np.float64]) -> None:
-        """Say how far steps resolve the waves of each cloth of rectangles (`springs.resolved_share`), (b,)."""
-        self._resolves = bool(resolved[list(self.cloths)].any())
-        shares = newmark_shares(resolved[self._cloth_of], KEPT_BY_SHEARS)
-        self.on_device.shares.from_numpy(shares.astype(np.float32))
-        self.on_device.offset.fill(0.0)
-
-    def foresee(self, nodes: Nodes, dt: float) -> None:
-        """Note what shears feel of a step of dt [s] by what their nodes do at its start, before these accelerate."""
-        if self._resolves:
-            offset_shears(self.on_device, self.count, nodes, dt)
 
     def measure_strains(self, nodes: Nodes, *, is_damped: bool) -> None:
         """Mean strains of the nodes of triangles, as they are, with what damping adds to them."""
@@ -200,19 +183,17 @@ def solve_shear(
     """
     d_u, d_v, w = ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes)
     strength, before = ti.Vector.zero(ti.f32, lanes), ti.Vector.zero(ti.f32, lanes)
-    offset = ti.Vector.zero(ti.f32, lanes)
     for at in range(lanes):
         s = first + at
         if s < end:
             set_column(d_u, at, derivative(cells.along, cells, nodes, nodes.displacement, s, RECTANGLE))
             set_column(d_v, at, derivative(cells.across, cells, nodes, nodes.displacement, s, RECTANGLE))
             set_column(w, at, weights(cells, nodes, s))
-            strength[at], offset[at] = cells.shares[s][0] * cells.law[s][1] * dt_squared, cells.offset[s]
-            before[at] = ti.select(is_first, 0.0, cells.multiplier[s])
+            strength[at], before[at] = cells.law[s][1] * dt_squared, ti.select(is_first, 0.0, cells.multiplier[s])
     for at in range(lanes):
         shear, by_u, by_v = shear_of(column(d_u, at), column(d_v, at))
         stiffness = strength[at] * weight_along(by_u, by_v, column(w, at))
-        change = -over_relaxed(stiffness) * (strength[at] * (shear - offset[at]) + before[at]) / (stiffness + 1.0)
+        change = -over_relaxed(stiffness) * (strength[at] * shear + before[at]) / (stiffness + 1.0)
         before[at] += change
         set_column(d_u, at, change * by_u)
         set_column(d_v, at, change * by_v)
@@ -220,19 +201,6 @@ def solve_shear(
         if first + at < end:
             cells.multiplier[first + at] = before[at]
             push_nodes(first + at, cells, nodes, column(d_u, at), column(d_v, at), nodes.displacement)
-
-
-@kernel
-def offset_shears(cells: CellArrays, count: ti.i32, nodes: Nodes, dt: ti.f32):
-    """By how much the shear of rectangles is felt as less in a step (`springs.newmark_shares`)."""
-    for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, nodes.carry, s, RECTANGLE)
-        d_v = derivative(cells.across, cells, nodes, nodes.carry, s, RECTANGLE)
-        rate_u = velocity_derivative(cells.along, cells, nodes, s, RECTANGLE)
-        rate_v = velocity_derivative(cells.across, cells, nodes, s, RECTANGLE)
-        shear = shear_of(d_u, d_v)[0]
-        ahead = shear_of(d_u + dt * rate_u, d_v + dt * rate_v)[0] - shear
-        cells.offset[s] = offset_of(shear, ahead, cells.shares[s])
 
 
 @large_kernel

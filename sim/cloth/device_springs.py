@@ -143,12 +143,6 @@ def measure_contraction(
         springs.shift[s] = contraction.poisson[s] * springs.law[s][0] * across
 
 
-@ti.func
-def offset_of(strain: ti.f32, ahead: ti.f32, shares: ti.math.vec2) -> ti.f32:
-    """By how much a strain is felt as less that velocities at the start of a step would make so much larger in it."""
-    return strain * (1.0 - 1.0 / shares[0]) + shares[1] / shares[0] * ahead
-
-
 @func
 def coefficient(springs: SpringArrays, s: ti.i32, arity: ti.template(), a: ti.template()) -> ti.f32:
     """c_a of spring s: (1, -1), (1, -2, 1), or its own four."""

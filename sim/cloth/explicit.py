@@ -41,7 +41,7 @@ class ExplicitSprings:
         )
         self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
 
-    def take_parameters(self, resolved: NDArray[np.float64]) -> None:
+    def take_parameters(self) -> None:
         """Springs hold their own stiffness."""
 
     def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:  # noqa: ARG002  (the integrators' protocol)

@@ -1,7 +1,6 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
@@ -23,11 +22,10 @@ from sim.cloth.parameters import (
     RUNAWAY_SPEED,
     ClothParameters,
     shared_conflicts,
-    substeps_of,
 )
 from sim.cloth.pins import Pins
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import ACCURATE_SHARE, joined, resolved_share, springs_of, too_few_substeps
+from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths, Load, finish_step
 from sim.cloth.totals import ClothTotals
@@ -152,7 +150,6 @@ class ClothSolver:
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, self._cells)
         self._totals = ClothTotals(self.state, self._springs, self._cells)
         self._frame_dt = 1.0 / frames_per_second
-        self._edges = [math.sqrt(sheet.grid.step_x * sheet.grid.step_y) if sheet.grid else 0.0 for sheet in sheets]
         self.air = ClothAir(self.state)
         self._forces = (forces or ForceField(())).on([(name,) for name in self.state.names])
         self._pins = Pins(self.parameters, sheets, self.state)
@@ -334,24 +331,13 @@ class ClothSolver:
         self.state.set_material(cloths)
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
+        self._integrator.take_parameters()
         self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
         self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
         self._refines = np.array([cloth.substeps is None for cloth in cloths])
         self._adapts = self._takes_turns & self._refines
-        self._integrator.take_parameters(self._resolved_shares())
         self.air.take_parameters(cloths)
         self._mass = float(self.state.mass.to_numpy().sum(dtype=np.float64))
-
-    def _resolved_shares(self) -> NDArray[np.float64]:
-        """How far steps resolve the waves of each cloth, (b,): nothing where more sweeps, or shorter steps, may not
-        take away what they leave unsolved; by the usual steps, also where these are shortened.
-        """
-        dt = self._frame_dt / substeps_of(self.parameters)
-        shares = [
-            resolved_share(cloth, edge, dt) if edge and adapts else 0.0
-            for cloth, edge, adapts in zip(self.parameters, self._edges, self._adapts, strict=True)
-        ]
-        return np.array(shares)
 
     def _largest_dts(self) -> tuple[float, float]:
         """Largest step without contacts [s]: of cloths that are given `substeps`, and of those that omit it.

@@ -276,38 +276,7 @@ def greedy_colours(nodes: NDArray[np.integer], node_count: int) -> NDArray[np.in
     return colours
 
 
-KEPT_BY_THREADS, KEPT_BY_SHEARS = (0.5, 0.15), (0.5, 0.48)
-"""Shares a and c (`newmark_shares`) where steps resolve waves in the plane. Waves are stable for a + c >= 1/2, and keep
-their energy for a = c; threads at a = c would keep what sweeps leave unsolved, too."""
-
-RESOLVED_SHEAR, RESOLVED_STRETCH = 0.8, 7.0
-"""Ways of waves of shear, and along threads, in a step, in edges, up to which steps resolve them: twice as far, sheets
-on two corners keep more of what sweeps leave unsolved than they lose."""
-
-LEAST_RESOLVED = 0.01  # shares of Newmark's scheme below this are none
-
-
-def resolved_share(cloth: ClothParameters, edge: float, dt: float) -> float:
-    """How far steps of dt [s] resolve the waves of a rectangle with such an edge [m]: from 0 to 1."""
-    shear, stretch = (math.sqrt(each / cloth.mass_per_area) for each in (cloth.shear_stiffness, cloth.plane_stiffness))
-    way = dt / edge * max(shear / RESOLVED_SHEAR, stretch / RESOLVED_STRETCH)
-    share = 1.0 / (1.0 + way**8)
-    return share if share > LEAST_RESOLVED else 0.0
-
-
-def newmark_shares(resolved: Floats, kept: tuple[float, float]) -> Floats:
-    """Shares a and c of displacements in what springs or cells feel, (m, 2), by what is `kept` and how far waves are
-    `resolved`, (m,).
-
-    Their force in a step is that of the length l_0 + a (l(u) - l_0) - c (l(v dt) - l_0), with l_0 at the start, u the
-    displacements and v the velocities at the start, so that what rests does so at any a and c. Implicit Euler has a = 1
-    and c = 0, and ends all waves that cross an edge in a step; with others it is Newmark's scheme (1959) of beta = a,
-    gamma = 1/2 + a - c. Springs that are solved at a length feel it as less by an `offset`, and their compliance is
-    1 / (a k dt²).
-    """
-    a, c = kept
-    return np.stack([1.0 - resolved * (1.0 - a), resolved * c], axis=1)
-
+Floats = NDArray[np.float64]
 
 STEP_SAFETY = 0.7
 """Share of the linear limit that counts as stable, omega dt < 1.4: springs that turn are not linear, and modes that

@@ -4,21 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
 from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
-from sim.cloth.device_springs import (
-    LANES,
-    TINY_LENGTH,
-    DeviceSprings,
-    colour_bounds,
-    column,
-    offset_of,
-    set_column,
-)
-from sim.cloth.springs import KEPT_BY_THREADS, newmark_shares
+from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
 from sim.cloth.state import ClothState
-from sim.core.arrays import Integers
+from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func, with_room
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import runs_on_gpu
@@ -70,23 +60,9 @@ class ThreadSolver:
         is_taut = ti.ndarray(ti.i32, len(starts) - 1)
         self._work: ThreadWork = with_room(ThreadWork, springs.count, is_taut=is_taut)
         self._found = ti.ndarray(ti.i32, 2)
-        self._resolves = False
         self._rows = LEAST_BLOCK
         while self._rows < np.diff(starts).max(initial=0) + 1:
             self._rows *= 2
-
-    def resolve_waves(self, resolved: NDArray[np.float64]) -> None:
-        """Say how far steps resolve the waves of each cloth (`springs.resolved_share`), (b,)."""
-        self._resolves = bool(resolved[list(self.springs.cloths)].any())
-        shares = newmark_shares(resolved[self.springs.cloth_of], KEPT_BY_THREADS)
-        self._work.shares.from_numpy(shares.astype(np.float32))
-        self._work.offset.fill(0.0)
-
-    def foresee(self, state: ClothState, dt: float) -> None:
-        """Note what springs feel of a step of dt [s] by what their nodes do at its start, before these accelerate."""
-        if self._resolves:
-            self.springs.contract(state.nodes, state.carry)
-            offset_threads(self.springs.on_device, self.springs.count, state.nodes, dt, self._work)
 
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
@@ -111,19 +87,9 @@ class ThreadSolver:
         (`excess_of`).
         """
         springs = self.springs
-        return measure_excess.later(springs.on_device, springs.count, self._work, state.nodes, dt * dt, self._found)
-
-
-@kernel
-def offset_threads(springs: SpringArrays, count: ti.i32, nodes: Nodes, dt: ti.f32, work: ThreadWork):
-    """By how much springs are felt as shorter in a step (`springs.newmark_shares`)."""
-    for s in range(count):
-        i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (nodes.carry[i] - nodes.carry[j])
-        length = d.norm()
-        ahead = (d + dt * (nodes.velocity[i] - nodes.velocity[j])).norm() - length
-        stretch = length - springs.law[s][0] + springs.shift[s]
-        work.offset[s] = offset_of(stretch, ahead, work.shares[s])
+        return measure_excess.later(
+            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found
+        )
 
 
 @ti.func
@@ -209,13 +175,8 @@ def solve_forth(
                 set_column(after, at, column(before, at) + (column(u, at) - nodes.displacement[j]))
                 set_column(u, at, nodes.displacement[j])
                 set_column(x, at, nodes.lattice[j])
-                w_j[at], compliance[at] = nodes.inverse_mass[j], 1.0 / (work.shares[s][0] * law[1] * dt * dt)
-                missing[at] = (
-                    law[0]
-                    - springs.shift[s]
-                    + work.offset[s]
-                    - ti.select(is_first, 0.0, compliance[at] * work.multiplier[s])
-                )
+                w_j[at], compliance[at] = nodes.inverse_mass[j], 1.0 / (law[1] * dt * dt)
+                missing[at] = law[0] - springs.shift[s] - ti.select(is_first, 0.0, compliance[at] * work.multiplier[s])
         for at in range(LANES):
             length[at] = ti.max(column(after, at).norm(), TINY_LENGTH)
             direction = direction_of(column(before, at), column(after, at) / length[at])
@@ -328,7 +289,7 @@ def solve_threads(
                     d = at_start + (u - ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1]))
                     length = ti.max(d.norm(), TINY_LENGTH)
                     n = direction_of(at_start, d / length)
-                    compliance = 1.0 / (work.shares[s][0] * springs.law[s][1] * dt * dt)
+                    compliance = 1.0 / (springs.law[s][1] * dt * dt)
                     if not is_first:
                         before = work.multiplier[s]
                 ti.simt.block.sync()
@@ -339,7 +300,7 @@ def solve_threads(
                 lower, diagonal, upper, missing = 0.0, 1.0, 0.0, 0.0
                 if k < count:
                     diagonal = w_i + w_j + compliance
-                    missing = springs.law[s][0] - springs.shift[s] + work.offset[s] - length - compliance * before
+                    missing = springs.law[s][0] - springs.shift[s] - length - compliance * before
                     if k > 0:
                         lower = -w_i * n.dot(ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1]))
                     if k + 1 < count:
@@ -453,7 +414,7 @@ def excess_of(
 
 @kernel
 def measure_excess(
-    springs: SpringArrays, count: ti.i32, work: ThreadWork, nodes: Nodes, dt_squared: ti.f32, found: Integers
+    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
 ) -> ti.math.vec2:
     """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
     end, whole_end = count, whole_warps(count)
@@ -463,14 +424,7 @@ def measure_excess(
         if s < end:
             i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
             excess = excess_of(
-                i,
-                j,
-                springs.law[s][0],
-                springs.shift[s] - work.offset[s],
-                work.shares[s][0] * springs.law[s][1],
-                work.multiplier[s],
-                nodes,
-                dt_squared,
+                i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
             )
         # Bits of numbers from 0 on are in their order.
         largest = largest_in_warp(ti.bit_cast(ti.select(excess > 0.0, excess, 0.0), ti.i32))

@@ -157,12 +157,8 @@ class XPBDSprings:
         self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
         self._threads = [ThreadSolver(family) for family in springs if family.in_segments]
 
-    def take_parameters(self, resolved: NDArray[np.float64]) -> None:
-        """Mass of meshes as it is now, and how far steps resolve the waves of each cloth (`springs.resolved_share`),
-        (b,); lists of springs hold their stiffness.
-        """
-        for elements in (*self._threads, *self._shears):
-            elements.resolve_waves(resolved)
+    def take_parameters(self) -> None:
+        """Mass of meshes as it is now; lists of springs hold their stiffness."""
         for triangles in self._triangles:
             triangles.take_parameters()
 
@@ -194,8 +190,7 @@ class XPBDSprings:
         return float("inf")
 
     def accelerate(self, dt: float) -> None:
-        """Damp the velocities along springs between two nodes, and in the shear of rectangles; and foresee from them
-        what these feel.
+        """Damp the velocities along springs between two nodes, and in the shear of rectangles.
 
         Apart from their own sweep: there, a damping of gamma = tau / dt (Macklin et al. 2016, eq. 26) also brakes what
         the sweep has to undo of the prediction, and makes their largest stiffness 1 + gamma times smaller. Bend springs
@@ -208,10 +203,6 @@ class XPBDSprings:
         for cells in (each for each in self._shears if each.is_damped):
             for colour in cells.first_colours:
                 damp_shears(cells.on_device, colour, state.nodes, dt, cells.first_colours.step)
-        for threads in self._threads:
-            threads.foresee(state, dt)
-        for cells in self._shears:
-            cells.foresee(state.nodes, dt)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""

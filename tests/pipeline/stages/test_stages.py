@@ -48,6 +48,7 @@ def test_every_frame_gets_its_surface_volume_and_picture():
         "surface": 40,
         "cloth": 0,
         "animated": 0,
+        "soft": 0,
         "volume": 40,
         "whitewater": 0,
         "bounds": 0,

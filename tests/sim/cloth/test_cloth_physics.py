@@ -141,14 +141,13 @@ def test_iterations_bring_springs_at_a_corner_to_what_short_steps_find():
 
 
 @pytest.mark.parametrize("pins", [[{"edge": "x-"}], [{"corner": "x-y-"}, {"corner": "x-y+"}]], ids=["edge", "corners"])
-@pytest.mark.parametrize("nodes", [25, 33, 65])
-def test_an_undamped_sheet_that_swings_keeps_its_energy(nodes, pins):
+def test_an_undamped_sheet_that_swings_keeps_its_energy(pins):
     """At the default steps, 95 % of m g L / 2, which is turned over, in a second; and it gains 3 % at most.
 
     With one sweep a step it gains 64 % in between, as two corners are to hold 4,225 nodes; with springs that push along
-    their predicted directions it loses 6 to 7 %, as coarse ones do by implicit Euler alone.
+    their predicted directions it loses 6 to 7 %.
     """
-    solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (nodes, nodes)), pin=pins, **VACUUM, **UNDAMPED))
+    solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (65, 65)), pin=pins, **VACUUM, **UNDAMPED))
     scale = solver.diagnostics()["mass"] * GRAVITY * 0.5
     gained = []
     for frame in range(60):

@@ -47,7 +47,7 @@ def dye_poured_on_a_ball() -> tuple[str, float]:
 def water_on_cloth() -> tuple[str, float]:
     tank = ClothTank(
         cloth={"shape": rectangle(0.16, 9), "position": (0.0, 0.0, 0.1), "mass_per_area": 0.2, "pin": EDGES},
-        water=((-0.08, -0.08, 0.12), (0.08, 0.08, 0.2)),
+        water=((-0.08, -0.08, 0.1), (0.08, 0.08, 0.18)),
         solver="dfsph",
         wall_friction=1.0,
         domain={"min": (-0.08, -0.08, 0.0), "max": (0.08, 0.08, 0.3)},
