@@ -35,8 +35,8 @@ def solve_threads(
     colours: int,
 ) -> None:
     lattice, w, u = (read(array) for array in (nodes.lattice, nodes.inverse_mass, nodes.displacement))
-    law, shift, multiplier, tension, shares, offset = (
-        read(each) for each in (springs.law, springs.shift, work.multiplier, work.tension, work.shares, work.offset)
+    law, shift, multiplier, tension = (
+        read(each) for each in (springs.law, springs.shift, work.multiplier, work.tension)
     )
     taut = work.is_taut.to_numpy()
     for piece, own, chain in pieces_of(springs, first, colours):
@@ -45,12 +45,12 @@ def solve_threads(
         length, start_length = (np.linalg.norm(each, axis=1) for each in (d, at_start))
         is_alike = (at_start * d).sum(axis=1) > LEAST_ALIKE * start_length * length
         n = np.where(is_alike[:, None], at_start / start_length[:, None], d / length[:, None])
-        compliance = 1.0 / (shares[own, 0] * law[own, 1] * dt * dt)
+        compliance = 1.0 / (law[own, 1] * dt * dt)
         before = 0.0 * length if is_first else multiplier[own]
         weight = w[chain[:-1]] + w[chain[1:]]
         beside = -w[chain[1:-1]] * (n[:-1] * n[1:]).sum(axis=1)
         system = np.diag(weight + compliance) + np.diag(beside, 1) + np.diag(beside, -1)
-        change = np.linalg.solve(system, law[own, 0] - shift[own] + offset[own] - length - compliance * before)
+        change = np.linalg.solve(system, law[own, 0] - shift[own] - length - compliance * before)
         push = np.zeros((len(chain), 3))
         push[:-1] += change[:, None] * n
         push[1:] -= change[:, None] * n
