@@ -298,15 +298,15 @@ def _snow(builder: NodeBuilder, context: LookContext) -> None:
 
 @draws("jelly")
 def _jelly(builder: NodeBuilder, context: LookContext) -> None:
-    """Gelatine with fruit: light goes in, is scattered and comes out coloured, under a wet skin."""
+    """Gelatine with fruit: most light goes through and comes out coloured, some is scattered, under a wet skin."""
     _even(
         builder,
         context,
-        color=(0.75, 0.04, 0.05),
-        roughness=0.08,
-        Subsurface_Weight=0.6,
-        Subsurface_Scale=0.02,
-        Transmission_Weight=0.45,
+        color=(0.85, 0.06, 0.05),
+        roughness=0.06,
+        Subsurface_Weight=0.3,
+        Subsurface_Scale=0.03,
+        Transmission_Weight=0.8,
         IOR=1.35,
     )
 

@@ -82,7 +82,7 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_soft_matter_among_bodies(self) -> Self:
-        """Soft matter passes what no coupling of its own knows, which would be seen."""
+        """Soft matter has couplings with rigid bodies alone, and would pass through the others."""
         for name, there in (("fluid", self.fluid), ("cloth", self.cloth), ("smoke", self.smoke)):
             if self.soft and there:
                 raise KeyRefusedError(

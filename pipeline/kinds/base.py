@@ -144,6 +144,8 @@ class Kind:
     lighter: str = ""  # what of it takes less memory, for people: "a larger fluid.particle_radius"
     # its solvers in a scene, at so many frames a second; None for the kinds that `sim.build` couples
     solvers: Callable[[SceneParameters, float], Sequence[Solver]] | None = None
+    # of kinds that grow by themselves: why a job has no memory for so many more elements just then; None if it has
+    growth: Callable[[Job], Callable[[float], str | None]] | None = None
     # whether a body is one of those that have one solver, which is called by the name of the kind; None for kinds whose
     # solvers have the names of their bodies
     shares_solver: Callable[[Any], bool] | None = None

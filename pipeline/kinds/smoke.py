@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,6 +55,12 @@ def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -
     from pipeline.kinds.checks.smoke import check_smokes
 
     return check_smokes(job, solids, budget, findings)
+
+
+def _growth(job: Job) -> Callable[[float], str | None]:
+    from pipeline.kinds.checks.smoke import growth_refusal
+
+    return growth_refusal(job)
 
 
 def _coarser(job: Job, factor: float, solids: SolidBuilder | None) -> list[Change]:
@@ -153,6 +159,7 @@ SMOKE = Kind(
     check=_check,
     coarser=_coarser,
     lighter="a larger smoke.cell_size",
+    growth=_growth,
     codec=_codec,
     product=VOLUME,
     objects=_objects,

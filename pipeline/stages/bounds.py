@@ -85,11 +85,7 @@ class BoundsStage(Stage):
                 tools=tools,
                 domain=job.domain,
                 smoke={smoke.name: smoke.corners(job.domain) for smoke in job.smoke},
-                **(
-                    {"endless": endless}
-                    if (endless := [smoke.name for smoke in job.smoke if smoke.grid == "open"])
-                    else {}
-                ),
+                **({"endless": endless} if endless else {}),
                 static={body.name: {"position": body.position, "rotation_deg": body.rotation_deg} for body in static},
                 tank=job.has_panes,
                 **({"beside": beside} if (beside := _beside(job)) else {}),

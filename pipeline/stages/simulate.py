@@ -159,7 +159,6 @@ class _Simulation:
     """One attempt at the simulation of a job."""
 
     def __init__(self, context: TaskContext) -> None:
-        from pipeline.kinds.checks.smoke import growth_refusal
         from sim.core.launch import on_compiled  # it loads Taichi, which plans need not
 
         self._context = context
@@ -168,9 +167,9 @@ class _Simulation:
         make_folder(self._folder, within=context.layout.root)
         self._device = initialize(context.job.chosen_device, threads=context.threads, gpu=context.gpu)
         self._world = world_of(context.job)
-        for solver in self._world.solvers.values():
-            if isinstance(solver, Grows):
-                solver.refusal = growth_refusal(context.job)
+        for _, kind, body in bodies(context.job):
+            if kind.growth is not None and isinstance(solver := self._world.solvers[body.name], Grows):
+                solver.refusal = kind.growth(context.job)
         self._checkpointed_at = time.monotonic()
         self._last_checkpoint = -1
 

@@ -169,8 +169,6 @@ def counting_sort(
     """Sort by cell; returns how many points were dropped, which are in one cell more than the grid has.
 
     For the outermost level of a kernel: its loops then run in parallel.
-
-    Threads race for the places in a cell, the insertion sort settles it.
     """
     cell_count = grid.shape[0] * grid.shape[1] * grid.shape[2]
     for cell in range(cell_count + 1):
@@ -184,6 +182,17 @@ def counting_sort(
             dropped += 1
         arrays.cell_of[i] = cell
         ti.atomic_add(arrays.cursor[cell], 1)
+    settle_in_cells(count, cell_count, ids, True, arrays)
+    return dropped
+
+
+@func
+def settle_in_cells(count: ti.i32, cell_count: ti.i32, ids: Integers, by_id: ti.template(), arrays: SortArrays):
+    """Sort points whose cells, and the numbers of points in these at `cursor`, are known; one cell more takes the rest.
+
+    Points of a cell are in the order of their ids, or of their numbers. Threads race for the places in it, the
+    insertion sort settles it. For the outermost level of a kernel, as `counting_sort`.
+    """
     scan_in_parallel(arrays.cursor, cell_count + 1, arrays.scratch, arrays.cell_start)
     for cell in range(cell_count + 1):
         arrays.cursor[cell] = arrays.cell_start[cell]
@@ -195,8 +204,16 @@ def counting_sort(
         for k in range(first + 1, arrays.cell_start[cell + 1]):
             point = arrays.order[k]
             slot = k
-            while slot > first and ids[arrays.order[slot - 1]] > ids[point]:
+            while slot > first and is_behind(arrays.order[slot - 1], point, ids, by_id):
                 arrays.order[slot] = arrays.order[slot - 1]
                 slot -= 1
             arrays.order[slot] = point
-    return dropped
+
+
+@func
+def is_behind(one: ti.i32, other: ti.i32, ids: Integers, by_id: ti.template()) -> ti.i32:
+    """Whether a point belongs behind another one of its cell."""
+    behind = one > other
+    if ti.static(by_id):
+        behind = ids[one] > ids[other]
+    return ti.cast(behind, ti.i32)

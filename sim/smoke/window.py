@@ -75,8 +75,7 @@ class Fitting:
         """The window of the coming frame: the present one, unless that is too small or much too large.
 
         Air outside has the velocity of a wind [m/s]. Sources are those that emit in the frame, each between the corners
-        of where it does [m]; where neither they nor
-        anything else is left, the middle of the window is.
+        of where it does [m]. Where neither they nor anything else is left, the middle of the window stays.
         """
         emitting = self._in_cells(sources)
         soon, later = (

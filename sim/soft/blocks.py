@@ -14,6 +14,7 @@ import taichi as ti
 
 from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import bundle, func
+from sim.core.cells import SortArrays, settle_in_cells
 from sim.core.domain import DomainParameters
 from sim.core.launch import kernel
 from sim.core.scan import scan_in_parallel, scan_scratch_length
@@ -40,11 +41,7 @@ class Blocks(NamedTuple):
     place: Integers  # of each stored block in the lattice, (k,)
     ahead: Integers  # numbers of a block and the seven that follow it along the axes, x first, -1 for none, (8 k,)
     behind: Integers  # of a block and the seven before it
-    first: Integers  # first sorted particle of each cell, (k * NODES + 1,)
-    cursor: Integers  # of the sort, (k * NODES,)
-    scratch: Integers
-    cell: Integers  # of each particle, or -1 outside, (n,)
-    order: Integers  # particles by cell, (n,)
+    sort: SortArrays  # of particles by the cells of stored blocks; those that have left come last
     room: ti.i32  # k
 
 
@@ -69,17 +66,16 @@ class BlockGrid:
                 f"{EDGE * edge:g} m, more than {MOST_BLOCKS}; give a smaller domain or a larger cell_size"
             )
         total = math.prod(shape.astype(int).tolist())
-        self._domain, self._n, self.count = domain, particles, 0
+        self._n, self.count = particles, 0
         self._lattice = {
             "origin": tuple((low - RING * edge).tolist()),
             "edge": edge,
             "shape": tuple(shape.astype(int).tolist()),
             "mark": ti.ndarray(ti.i32, total),
             "number": ti.ndarray(ti.i32, total + 1),
-            "cell": ti.ndarray(ti.i32, max(particles, 1)),
-            "order": ti.ndarray(ti.i32, max(particles, 1)),
         }
         self._total = total
+        self._cell, self._order = (ti.ndarray(ti.i32, max(particles, 1)) for _ in range(2))
         self._make_room(64)
 
     def sort(self, position: ti.Ndarray, body: ti.Ndarray) -> bool:
@@ -97,15 +93,19 @@ class BlockGrid:
         return grown
 
     def _make_room(self, room: int) -> None:
-        cells = room * NODES
+        cells = room * NODES + 1  # one for particles that have left
         self.blocks = Blocks(
             **self._lattice,
             place=ti.ndarray(ti.i32, room),
             ahead=ti.ndarray(ti.i32, 8 * room),
             behind=ti.ndarray(ti.i32, 8 * room),
-            first=ti.ndarray(ti.i32, cells + 1),
-            cursor=ti.ndarray(ti.i32, cells),
-            scratch=ti.ndarray(ti.i32, scan_scratch_length(max(cells, self._total))),
+            sort=SortArrays(
+                cell_of=self._cell,
+                cursor=ti.ndarray(ti.i32, cells),
+                scratch=ti.ndarray(ti.i32, scan_scratch_length(max(cells, self._total))),
+                cell_start=ti.ndarray(ti.i32, cells + 1),
+                order=self._order,
+            ),
             room=room,
         )
 
@@ -191,26 +191,23 @@ def find_blocks(blocks: Blocks, position: Vectors, body: Integers, count: ti.i32
         blocks.number[m] = reached
     for m in range(total):
         blocks.mark[m] = blocks.number[m]
-    found = scan_in_parallel(blocks.mark, total, blocks.scratch, blocks.number)
+    found = scan_in_parallel(blocks.mark, total, blocks.sort.scratch, blocks.number)
     for m in range(total):
         if blocks.mark[m] == 0:
             blocks.number[m] = -1
         elif blocks.number[m] < blocks.room:
             blocks.place[blocks.number[m]] = m
     for p in range(count):
-        cell = -1
+        cell = found * NODES
         if body[p] >= 0:
             cell = node_at(base_of(position[p], blocks), blocks)
-        blocks.cell[p] = cell
+        blocks.sort.cell_of[p] = cell
     return found
 
 
 @kernel
 def sort_by_cell(blocks: Blocks, stored: ti.i32, count: ti.i32):
-    """Neighbours of blocks, and a counting sort, particles of a cell by number.
-
-    Threads race for the places in a cell, a sort by insertion settles it.
-    """
+    """Neighbours of blocks, and a counting sort, particles of a cell by number."""
     cells = stored * NODES
     for k in range(8 * stored):
         place = blocks.place[k // 8]
@@ -220,24 +217,8 @@ def sort_by_cell(blocks: Blocks, stored: ti.i32, count: ti.i32):
         if place >= step:
             behind = blocks.number[place - step]
         blocks.behind[k] = behind
-    for c in range(cells):
-        blocks.cursor[c] = 0
+    for c in range(cells + 1):
+        blocks.sort.cursor[c] = 0
     for p in range(count):
-        if blocks.cell[p] >= 0:
-            ti.atomic_add(blocks.cursor[blocks.cell[p]], 1)
-    scan_in_parallel(blocks.cursor, cells, blocks.scratch, blocks.first)
-    for c in range(cells):
-        blocks.cursor[c] = blocks.first[c]
-    for p in range(count):
-        if blocks.cell[p] >= 0:
-            slot = ti.atomic_add(blocks.cursor[blocks.cell[p]], 1)
-            blocks.order[slot] = p
-    for c in range(cells):
-        first = blocks.first[c]
-        for k in range(first + 1, blocks.first[c + 1]):
-            particle = blocks.order[k]
-            slot = k
-            while slot > first and blocks.order[slot - 1] > particle:
-                blocks.order[slot] = blocks.order[slot - 1]
-                slot -= 1
-            blocks.order[slot] = particle
+        ti.atomic_add(blocks.sort.cursor[blocks.sort.cell_of[p]], 1)
+    settle_in_cells(count, cells, blocks.sort.cell_of, False, blocks.sort)

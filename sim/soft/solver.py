@@ -33,7 +33,6 @@ from sim.soft.transfers import (
     Nodes,
     Particles,
     Shares,
-    Weights,
     grid_to_particles,
     measure,
     particles_to_grid,
@@ -96,10 +95,7 @@ class SoftSolver:
         self.particles = Particles(
             on_device(position), on_device(velocity), *matrices, ti.ndarray(ti.f32, n), on_device(body), n
         )
-        self._weights = Weights(
-            on_device(particle_mass),
-            on_device(np.full(len(parameters), volume)),
-        )
+        self._masses, self._volume = on_device(particle_mass), volume
         self._laws = laws_of(self.parameters)
         self._grid = BlockGrid(domain, self.parameters[0].cell_size, n)
         self._make_nodes()
@@ -143,9 +139,8 @@ class SoftSolver:
         if grid.sort(particles.position, particles.body):
             self._make_nodes()
         blocks, stored = grid.blocks, grid.count
-        particles_to_grid(
-            blocks, stored, particles, self._weights, self._shares, self._nodes, ti.math.vec3(self.gravity), dt
-        )
+        given = self._masses, self._volume, self._shares, self._nodes, ti.math.vec3(self.gravity)
+        particles_to_grid(blocks, stored, particles, *given, dt)
         if self.contacts is not None:
             self.contacts.resolve(blocks, stored, self._nodes, dt)
         stop_at_walls(blocks, stored, self._nodes, self._box, self.parameters[0].friction)
@@ -209,7 +204,7 @@ class SoftSolver:
         """Momentum, energies and sizes."""
         body = copied(self.particles.body)
         inside = body >= 0
-        mass = copied(self._weights.mass)[body[inside]].astype(np.float64)
+        mass = copied(self._masses)[body[inside]].astype(np.float64)
         position, velocity = (
             copied(array)[inside].astype(np.float64) for array in (self.particles.position, self.particles.velocity)
         )

@@ -54,14 +54,6 @@ class Particles(NamedTuple):
 
 
 @bundle
-class Weights(NamedTuple):
-    """Mass of a particle of each body [kg], and its volume at rest [m³], (bodies,)."""
-
-    mass: Floats
-    volume: Floats
-
-
-@bundle
 class Shares(NamedTuple):
     """What the particles of each cell give each of their 27 nodes, (k * 64 * 27,); of no meaning in empty cells."""
 
@@ -114,8 +106,8 @@ def give(
     at = ti.cast(corner + Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2), ti.f32)
     mass = 0.0
     momentum = ti.math.vec3(0.0)
-    for s in range(blocks.first[cell], blocks.first[cell + 1]):
-        p = blocks.order[s]
+    for s in range(blocks.sort.cell_start[cell], blocks.sort.cell_start[cell + 1]):
+        p = blocks.sort.order[s]
         away = at - place_of(particles.position[p], blocks)
         weight = weight_at(away)
         own = masses[particles.body[p]]
@@ -131,30 +123,34 @@ def particles_to_grid(
     blocks: Blocks,
     stored: ti.i32,
     particles: Particles,
-    weights: Weights,
+    masses: Floats,
+    volume: ti.f32,
     shares: Shares,
     nodes: Nodes,
     gravity: ti.math.vec3,
     dt: ti.f32,
 ):
-    """Mass and velocity of the nodes, gravity included; C becomes its momentum with the impulse of the stress."""
+    """Mass and velocity of the nodes, gravity included; C becomes its momentum with the impulse of the stress.
+
+    Particles have masses by body [kg], and all of them one volume at rest [m³].
+    """
     for p in range(particles.count):
         b = particles.body[p]
         if b >= 0:
-            pull = dt * weights.volume[b] * APIC / blocks.edge
-            particles.affine[p] = blocks.edge * weights.mass[b] * particles.affine[p] - pull * particles.stress[p]
+            pull = dt * volume * APIC / blocks.edge
+            particles.affine[p] = blocks.edge * masses[b] * particles.affine[p] - pull * particles.stress[p]
     if ti.static(runs_on_gpu()):
         ti.loop_config(block_dim=128)
         for i in range(stored * (NODES * WARP)):
             cell = i // WARP
-            if i % WARP < SHARES and blocks.first[cell] < blocks.first[cell + 1]:
-                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, weights.mass, shares)
+            if i % WARP < SHARES and blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
+                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, masses, shares)
     else:
         for cell in range(stored * NODES):
-            if blocks.first[cell] < blocks.first[cell + 1]:
+            if blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
                 corner = node_of(cell, blocks)
                 for lane in range(SHARES):
-                    give(cell, corner, lane, blocks, particles, weights.mass, shares)
+                    give(cell, corner, lane, blocks, particles, masses, shares)
     for n in range(stored * NODES):
         inside = Triple(n % EDGE, n // EDGE % EDGE, n % NODES // (EDGE * EDGE))
         mass = 0.0
@@ -162,7 +158,7 @@ def particles_to_grid(
         for lane in range(SHARES):
             base = inside - Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2)
             cell = cell_behind(n // NODES, base, blocks)
-            if cell >= 0 and blocks.first[cell] < blocks.first[cell + 1]:
+            if cell >= 0 and blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
                 mass += shares.mass[cell * SHARES + lane]
                 momentum += shares.momentum[cell * SHARES + lane]
         nodes.mass[n] = mass
@@ -181,8 +177,8 @@ def grid_to_particles(
 ):
     """Velocities from nodes; places, strains and stresses after the step. What passed an open face leaves."""
     h = blocks.edge
-    for s in range(blocks.first[stored * NODES]):
-        p = blocks.order[s]
+    for s in range(blocks.sort.cell_start[stored * NODES]):
+        p = blocks.sort.order[s]
         x = particles.position[p]
         place = place_of(x, blocks)
         base = base_of(x, blocks)

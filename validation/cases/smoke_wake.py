@@ -88,7 +88,8 @@ def draw(results: Sequence[CaseResult]) -> Figure:
     series = results[0].series
     for n, shade in zip(series["cells"], SHADES, strict=False):
         wake.plot(series[f"times_{n}"], series[f"across_{n}"], color=shade, linewidth=1.0, label=f"{n} cells")
-    label_axes(wake, "time [s]", "velocity across [m/s]", "wake of a cylinder")
+    wake.set_ylim(-1.6, 2.2)  # room for the legend above the curves
+    label_axes(wake, "time [s]", "velocity across [m/s]", "wake of a cylinder", legend="upper left")
     found = [series[f"strouhal_{n}"][0] for n in series["cells"]]
     strouhal.plot(series["cells"], found, "o-", color=SHADES[0], label="found")
     strouhal.axhspan(0.9 * PUBLISHED, 1.1 * PUBLISHED, color=THEORY, alpha=0.15)
