@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 SURFACES = ("rigid", "fluid", "cloth")
 VOLUMES = ("smoke",)
+EMBERS = ("embers",)
 CLOTHS = ("cloth",)  # threads run along coordinates on the sheet at rest, which only cloths have
 NOTHING: tuple[str, ...] = ()
 
@@ -70,6 +71,7 @@ LOOK_TABLE: dict[str, LookRow] = {
     "muddy_water": LookRow(SURFACES, ("roughness", "density", "dye_color")),
     "smoke": LookRow(VOLUMES, VOLUME_KEYS),
     "fire": LookRow(VOLUMES, (*VOLUME_KEYS, *FLAME_KEYS)),
+    "embers": LookRow(EMBERS, FLAME_KEYS),
     "rubber": LookRow(SURFACES, ("roughness",), paints_parts=True, paves=True),
     "ceramic": LookRow(SURFACES, ("roughness",), paints_parts=True, paves=True),
     "plastic": LookRow(SURFACES, ("roughness",), paints_parts=True, paves=True),

@@ -37,18 +37,21 @@ FADE_S = 0.25
 """Over the end of its life a particle shrinks to nothing, instead of vanishing from one frame to the next [s]."""
 KINDS = ("spray", "foam", "bubbles")  # names of the values of `kind` of whitewater, from 0
 POINT = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz", "radius", "lifetime")), ("kind", "u1")])
-DYED_POINT = np.dtype([*POINT.descr, ("dye", "<f4")])  # of a drop of a fluid with dye
+OWN_COLUMNS = ("dye", "temperature")
+"""Columns that some clouds have, one at most: of drops of a fluid with dye, and of embers."""
+POINT_OF = {None: POINT, **{name: np.dtype([*POINT.descr, (name, "<f4")]) for name in OWN_COLUMNS}}
+"""Records of points by their own column."""
 _COMMENT = "comment not_made {not_made}\n"
-_DYE_LINE = "property float dye\n"
+_OWN_LINE = "property float {own}\n"
 _POINTS_HEADER = (
     f"ply\nformat binary_little_endian 1.0\n{_COMMENT}element vertex {{count}}\n"
     + "".join(f"property {'uchar' if POINT[name].kind == 'u' else 'float'} {name}\n" for name in POINT.names or ())
-    + f"{_DYE_LINE}end_header\n"
+    + f"{_OWN_LINE}end_header\n"
 )
 _POINTS_PATTERN = re.compile(
     re.escape(_POINTS_HEADER)
     .replace(re.escape(_COMMENT), f"(?:{re.escape(_COMMENT)})?")  # files of earlier versions lack it
-    .replace(re.escape(_DYE_LINE), f"(?P<dye>{re.escape(_DYE_LINE)})?")
+    .replace(re.escape(_OWN_LINE), f"(?:property float (?P<own>{'|'.join(OWN_COLUMNS)})\n)?")
     .replace(re.escape("{count}"), r"(?P<count>0|[1-9]\d{0,9})")
     .replace(re.escape("{not_made}"), r"(?P<not_made>0|[1-9]\d{0,18})")
     .encode("ascii")
@@ -173,14 +176,14 @@ def require_sound_mesh(mesh: SurfaceMesh) -> None:
         raise ValueError(f"a face names vertex {bad}, but there are {len(mesh.vertices)}")
 
 
-def written_header(record: np.dtype[np.void], *, count: int, not_made: int) -> bytes:
-    """The header of so many points of `POINT` or `DYED_POINT`, with how many had no room."""
-    header = _POINTS_HEADER if record == DYED_POINT else _POINTS_HEADER.replace(_DYE_LINE, "")
-    return header.format(count=count, not_made=not_made).encode("ascii")
+def written_header(own: str | None, *, count: int, not_made: int) -> bytes:
+    """The header of so many points with a column of their own or none, and how many had no room."""
+    header = _POINTS_HEADER if own is not None else _POINTS_HEADER.replace(_OWN_LINE, "")
+    return header.format(own=own, count=count, not_made=not_made).encode("ascii")
 
 
 def points_header(content: bytes) -> re.Match[bytes]:
-    """Match of the header of points with `count`, `dye` if they have some, and, but in earlier versions, `not_made`.
+    """Match of the header of points with `count`, `own` column or None, and, but in earlier versions, `not_made`.
 
     Raises:
         ValueError: it is not of this layout.
@@ -192,13 +195,13 @@ def points_header(content: bytes) -> re.Match[bytes]:
 
 
 def read_points(content: bytes) -> NDArray[np.void]:
-    """Rows of `POINT`, or of `DYED_POINT`, in a file's content.
+    """Rows of one of `POINT_OF` in a file's content.
 
     Raises:
         ValueError: it is not of this layout, or its size is not the one that its header promises.
     """
     header = points_header(content)
-    count, record = int(header["count"]), POINT if header["dye"] is None else DYED_POINT
+    count, record = int(header["count"]), POINT_OF[None if header["own"] is None else header["own"].decode()]
     _require_size(content, header.end() + count * record.itemsize)
     return np.frombuffer(content, record, count, header.end())
 

@@ -1,4 +1,4 @@
-"""Drops and whitewater: points from PLY files into Blender, drawn as spheres."""
+"""Drops, whitewater and embers: points from PLY files into Blender, drawn as spheres."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from blender_scripts.documents import content_of
 from blender_scripts.errors import RenderInputError
-from blender_scripts.geometry import DYE, new_object, set_attribute
-from blender_scripts.ply import DYED_POINT, KINDS, drawn_radii
+from blender_scripts.geometry import new_object, set_attribute
+from blender_scripts.ply import KINDS, OWN_COLUMNS, drawn_radii
 from blender_scripts.ply import read_points as read_rows
 from blender_scripts.shading import NodeBuilder
 
@@ -21,13 +21,13 @@ from blender_scripts.shading import NodeBuilder
 class Points:
     """Spheres in world space: positions [m] (n, 3), velocities [m/s] (n, 3) and radii [m] (n,), float32.
 
-    Drops of a fluid with dye have its concentration [-], (n,), float32; else it is None.
+    Drops of a fluid with dye have its concentration [-], and embers their temperature [K], (n,), float32, by its name.
     """
 
     positions: np.ndarray
     velocities: np.ndarray
     radii: np.ndarray
-    dye: np.ndarray | None
+    own: dict[str, np.ndarray]
 
 
 def read_points(path: Path, kind: str) -> Points:
@@ -48,7 +48,7 @@ def read_points(path: Path, kind: str) -> Points:
         positions=np.stack([chosen[name] for name in ("x", "y", "z")], axis=1).astype(np.float32),
         velocities=np.stack([chosen[name] for name in ("vx", "vy", "vz")], axis=1).astype(np.float32),
         radii=drawn_radii(chosen["radius"], chosen["lifetime"]),
-        dye=np.ascontiguousarray(chosen["dye"], np.float32) if chosen.dtype == DYED_POINT else None,
+        own={name: np.ascontiguousarray(chosen[name], np.float32) for name in OWN_COLUMNS if name in rows.dtype.names},
     )
 
 
@@ -83,7 +83,8 @@ def fill_points(mesh: Any, points: Points) -> None:
         mesh.attributes["position"].data.foreach_set("vector", points.positions.ravel())
     set_attribute(mesh, "velocity", None if is_empty else points.velocities)
     set_attribute(mesh, "radius", None if is_empty else points.radii)
-    set_attribute(mesh, DYE, None if is_empty else points.dye)
+    for name in OWN_COLUMNS:
+        set_attribute(mesh, name, None if is_empty else points.own.get(name))
     mesh.update()
 
 

@@ -1,4 +1,4 @@
-"""Looks of volumes: smoke, and fire, which is smoke that glows where it is hot."""
+"""Looks of volumes: smoke, and fire, which is smoke that glows where it is hot; and embers."""
 
 from __future__ import annotations
 
@@ -32,10 +32,7 @@ def _fire(builder: NodeBuilder, context: LookContext) -> None:
     glow = glow_of(context)
     shader, extinction = _principled(builder, context, color=(0.42, 0.40, 0.38))
     kelvin = builder.math("ADD", _grid(builder, "temperature"), glow.box.ambient_temperature)
-    exponent = builder.math("MULTIPLY_ADD", builder.math("DIVIDE", 1.0, kelvin), -LUMINANCE_EXPONENT_K, 0.0)
-    shift = LUMINANCE_EXPONENT_K / glow.flame_temperature
-    luminance = builder.math("EXPONENT", builder.math("ADD", exponent, shift))
-    color = builder.node("ShaderNodeBlackbody", Temperature=kelvin)
+    luminance, color = _black_body(builder, kelvin, glow.flame_temperature)
     # Lamps stand in for the glow (`flames`) where a ray would find it by chance only.
     path = builder.node("ShaderNodeLightPath")
     by_chance = builder.math("MAXIMUM", path.outputs["Is Diffuse Ray"], path.outputs["Is Volume Scatter Ray"])
@@ -43,7 +40,24 @@ def _fire(builder: NodeBuilder, context: LookContext) -> None:
     per_metre = builder.math("MULTIPLY", extinction, _grid(builder, "density"))
     strength = builder.math("MULTIPLY", builder.math("MULTIPLY", luminance, per_metre), seen)
     builder.link(strength, shader.inputs["Emission Strength"])
-    builder.link(color.outputs[0], shader.inputs["Emission Color"])
+    builder.link(color, shader.inputs["Emission Color"])
+
+
+@draws("embers")
+def _embers(builder: NodeBuilder, context: LookContext) -> None:
+    """Char that glows as a black body does, as bright as thick flames of its temperature are in the look `fire`."""
+    reference = or_default(context.flame_temperature, DEFAULT_FLAME_TEMPERATURE_K)
+    luminance, color = _black_body(builder, _grid(builder, "temperature"), reference)
+    emission = or_default(context.emission, DEFAULT_EMISSION)
+    glow = builder.node("ShaderNodeEmission", Color=color, Strength=builder.math("MULTIPLY", luminance, emission))
+    builder.surface(glow)
+
+
+def _black_body(builder: NodeBuilder, kelvin: Any, reference: float) -> tuple[Any, Any]:
+    """Luminance over that at a reference temperature [K], and colour, of black bodies: output sockets."""
+    exponent = builder.math("MULTIPLY_ADD", builder.math("DIVIDE", 1.0, kelvin), -LUMINANCE_EXPONENT_K, 0.0)
+    luminance = builder.math("EXPONENT", builder.math("ADD", exponent, LUMINANCE_EXPONENT_K / reference))
+    return luminance, builder.node("ShaderNodeBlackbody", Temperature=kelvin).outputs[0]
 
 
 def glow_of(context: LookContext) -> Glow:

@@ -1,4 +1,4 @@
-"""Drops and whitewater as binary PLY files of points, by numpy alone; `blender_scripts.ply` has the layout."""
+"""Drops, whitewater and embers as binary PLY files of points, by numpy alone; `blender_scripts.ply` has the layout."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from blender_scripts.ply import DYED_POINT, KINDS, POINT, drawn_radii, points_header, read_points, written_header
+from blender_scripts.ply import KINDS, OWN_COLUMNS, POINT_OF, drawn_radii, points_header, read_points, written_header
 from render.errors import InvalidFileError, invalid_if_refused
 
 __all__ = [
@@ -21,7 +21,7 @@ __all__ = [
     "write_point_cloud",
 ]
 
-_LONGEST_HEADER = len(written_header(DYED_POINT, count=0, not_made=0)) + 32
+_LONGEST_HEADER = max(len(written_header(own, count=0, not_made=0)) for own in OWN_COLUMNS) + 32
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class PointCloud:
         kind: index into `KINDS`, (n,), uint8.
         not_made: particles that the frame should have got, and had no room for.
         dye: concentration [-], (n,), float32, of drops of a fluid with dye; else None.
+        temperature: [K], (n,), float32, of embers; else None. A cloud has one of both at most.
     """
 
     position: NDArray[np.float32]
@@ -45,6 +46,12 @@ class PointCloud:
     kind: NDArray[np.uint8]
     not_made: int = 0
     dye: NDArray[np.float32] | None = None
+    temperature: NDArray[np.float32] | None = None
+
+    @property
+    def own(self) -> str | None:
+        """The column that this cloud has and others have not."""
+        return next((name for name in OWN_COLUMNS if getattr(self, name) is not None), None)
 
 
 @dataclass(frozen=True)
@@ -62,19 +69,19 @@ def write_point_cloud(path: Path, cloud: PointCloud) -> None:
         ValueError: the shapes do not fit together.
     """
     count = len(cloud.position)
-    names = ("position", "velocity", "radius", "lifetime", "kind", *(() if cloud.dye is None else ("dye",)))
+    names = ("position", "velocity", "radius", "lifetime", "kind", *(() if cloud.own is None else (cloud.own,)))
     shapes = {name: getattr(cloud, name).shape for name in names}
     expected = {"position": (count, 3), "velocity": (count, 3)}
     if any(shape != expected.get(name, (count,)) for name, shape in shapes.items()):
         raise ValueError(f"a cloud needs a row of each for every point, got {shapes}")
-    rows = np.empty(count, POINT if cloud.dye is None else DYED_POINT)
+    rows = np.empty(count, POINT_OF[cloud.own])
     for axis, name in enumerate("xyz"):
         rows[name], rows[f"v{name}"] = cloud.position[:, axis], cloud.velocity[:, axis]
     rows["radius"], rows["lifetime"], rows["kind"] = cloud.radius, cloud.lifetime, cloud.kind
-    if cloud.dye is not None:
-        rows["dye"] = cloud.dye
+    if cloud.own is not None:
+        rows[cloud.own] = getattr(cloud, cloud.own)
     with path.open("wb") as file:
-        file.write(written_header(rows.dtype, count=count, not_made=cloud.not_made))
+        file.write(written_header(cloud.own, count=count, not_made=cloud.not_made))
         file.write(rows.tobytes())
 
 
@@ -99,7 +106,7 @@ def read_point_cloud(path: Path) -> PointCloud:
         lifetime=rows["lifetime"].astype(np.float32),
         kind=rows["kind"].copy(),
         not_made=int(header["not_made"]),
-        dye=rows["dye"].astype(np.float32) if rows.dtype == DYED_POINT else None,
+        **{name: rows[name].astype(np.float32) for name in OWN_COLUMNS if name in (rows.dtype.names or ())},
     )
 
 
@@ -124,7 +131,7 @@ def validate_point_cloud(path: Path) -> None:
         OSError: it cannot be read.
     """
     cloud = read_point_cloud(path)
-    for name in ("position", "velocity", "radius", "lifetime", "dye"):
+    for name in ("position", "velocity", "radius", "lifetime", *OWN_COLUMNS):
         values = getattr(cloud, name)
         if values is not None and not np.isfinite(values).all():
             row = int(np.argwhere(~np.isfinite(values))[0][0])

@@ -18,11 +18,13 @@ from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
 from sim.coupling.emitter_bodies import with_emitters_on
 from sim.coupling.fluid_rigid import FluidRigidCoupling, samples_of_moving_bodies
 from sim.coupling.smoke_cloth import SmokeClothCoupling
+from sim.coupling.smoke_embers import AirOfSmoke
 from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
 from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
+from sim.embers.solver import EmberSolver
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.emitter import Carrier
 from sim.fluid.filling import fill_fluids, particle_capacity
@@ -104,6 +106,11 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static)
         if rigid is not None and soft.contacts is not None:
             couplings.append(SoftRigidCoupling(soft, rigid, soft.contacts))
+    by_name = {smoke.name: smoke for smoke in smokes}
+    for parameters in scene.embers:
+        air = AirOfSmoke(by_name[parameters.smoke], scene.domain)
+        given = {"gravity": scene.gravity, "frames_per_second": frames_per_second}
+        coupled.append(EmberSolver(parameters, air=air, **given))
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
     standing = {body.name: body.snapshot() for body in static}
     return World(
@@ -116,8 +123,8 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
 
 
 def _refuse_names(scene: SceneParameters) -> None:
-    """Refuse fluids and smokes with the name of a solver for many bodies."""
-    names = {body.name for body in (*scene.fluid, *scene.smoke)}
+    """Refuse fluids, smokes and embers with the name of a solver for many bodies."""
+    names = {body.name for body in (*scene.fluid, *scene.smoke, *scene.embers)}
     moves = any(body.kind != "static" for body in scene.rigid)
     for name, there, what in (
         (RIGID_NAME, moves, "moving bodies"),
@@ -125,7 +132,9 @@ def _refuse_names(scene: SceneParameters) -> None:
         (SOFT_NAME, bool(scene.soft), "soft bodies"),
     ):
         if name in names and there:
-            raise ValueError(f'"{name}" is what all {what} are called together; name the fluid or smoke otherwise')
+            raise ValueError(
+                f'"{name}" is what all {what} are called together; name the fluid, smoke or embers otherwise'
+            )
 
 
 def _build_fluids(

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
+from sim.embers.parameters import EmberParameters
 from sim.fluid.parameters import FluidParameters, dye_conflict
 from sim.forces.parameters import MOST_FORCES, Force, unknown_targets
 from sim.rigid.groups import with_groups
@@ -39,6 +40,7 @@ class SceneParameters(Parameters):
     soft: tuple[SoftParameters, ...] = Field(
         default=(), description="Sand, snow, jelly and clay; they share a grid, and meet walls and rigid bodies."
     )
+    embers: tuple[EmberParameters, ...] = Field(default=(), description="Embers that the air of a smoke carries.")
     force: Annotated[tuple[Force, ...], Field(max_length=MOST_FORCES)] = Field(
         default=(), description="Forces from outside, and moving air, that act on all bodies, or on some."
     )
@@ -87,6 +89,18 @@ class SceneParameters(Parameters):
             if self.soft and there:
                 raise KeyRefusedError(
                     ("soft", 0), f"meets walls and rigid bodies, and would pass through {name}; remove one of both"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _has_embers_in_smokes(self) -> Self:
+        names = [smoke.name for smoke in self.smoke]
+        for number, embers in enumerate(self.embers):
+            if embers.smoke not in names:
+                raise KeyRefusedError(
+                    ("embers", number, "smoke"),
+                    f'no smoke is named "{embers.smoke}"'
+                    + (f"; smokes are {', '.join(names)}" if names else "; add [[smoke]]"),
                 )
         return self
 

@@ -20,6 +20,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
 from pipeline.kinds.base import Kind
 from pipeline.kinds.cloth import CLOTH
+from pipeline.kinds.embers import EMBERS
 from pipeline.kinds.fluid import FLUID
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.smoke import SMOKE
@@ -44,7 +45,7 @@ from sim.shapes.parameters import Placement
 if TYPE_CHECKING:
     from sim.core.world import World
 
-KINDS: dict[str, Kind] = {kind.name: kind for kind in (RIGID, FLUID, CLOTH, SOFT, SMOKE)}
+KINDS: dict[str, Kind] = {kind.name: kind for kind in (RIGID, FLUID, CLOTH, SOFT, SMOKE, EMBERS)}
 """Every kind by its name, in the order in which a job's bodies are listed."""
 
 

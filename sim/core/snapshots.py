@@ -25,6 +25,8 @@ class Snapshot:
     - smoke: `density` (nx, ny, nz) [-], `temperature` (nx, ny, nz) [K], `velocity` (nx, ny, nz, 3) [m/s],
       all at cell centres. Attributes: `origin` (3,) lower corner of the grid [m], `cell_size` [m],
       `ambient_temperature` [K].
+    - embers: `position` (n, 3) [m], `velocity` (n, 3) [m/s], `temperature` (n,) [K], `diameter` (n,) [m], `particle_id`
+      (n,) int32, ascending. Attribute: `radius` of the mean size [m].
     - rigid: `position` (3,) [m], `orientation` (4,) unit quaternion w, x, y, z, `velocity` (3,) [m/s],
       `angular_velocity` (3,) [rad/s]; all float64. The mesh is the body's own, in its rest pose.
     - cloth: `position` (n, 3) [m], `velocity` (n, 3) [m/s], and the same in every frame: `triangles` (k, 3) int32, and

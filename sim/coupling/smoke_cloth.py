@@ -14,7 +14,8 @@ from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.solver import Coupling
 from sim.smoke.arrays import Faces, new_floats
-from sim.smoke.lanes import Grid, cell_counts, row_start
+from sim.smoke.interpolation import corner, weight
+from sim.smoke.lanes import Grid, cell_counts
 from sim.smoke.obstacles import time_of_travel
 
 if TYPE_CHECKING:
@@ -135,34 +136,12 @@ class SmokeClothCoupling(Coupling):
 
 
 @func
-def _corner(cells: Grid, place, axis: ti.template()):
-    """The lowest of the eight faces across an axis around a place in cells, and the offset from it in cells."""
-    low = ti.Vector([0, 0, 0])
-    offset = ti.Vector([0.0, 0.0, 0.0])
-    for a in ti.static(range(3)):
-        last = cell_counts(cells)[a] + ti.static(int(a == axis))
-        inside = ti.max(1.0, ti.min(place[a] + ti.static(1.0 if a == axis else 0.5), float(last)))
-        low[a] = ti.max(1, ti.min(int(inside), last - 1))
-        offset[a] = inside - low[a]
-    return row_start(cells, low[0], low[1]) + low[2], offset
-
-
-@func
-def _weight(cells: Grid, offset, n: ti.template()):
-    """Trilinear weight of corner n, and how far it is from the lowest one in the arrays."""
-    weight = 1.0
-    for a in ti.static(range(3)):
-        weight *= offset[a] if ti.static((n >> (2 - a)) & 1) else 1.0 - offset[a]
-    return weight, (n >> 2) * cells.step_x + (n >> 1 & 1) * cells.step_y + (n & 1)
-
-
-@func
 def _spread(cells: Grid, sums: LongIntegers, axis: ti.template(), place, value: ti.f32):
     """Add a value to the faces around a place; integers, so that the order does not matter."""
-    at, offset = _corner(cells, place, axis)
+    at, offset = corner(cells, place, axis)
     for n in ti.static(range(8)):
-        weight, step = _weight(cells, offset, n)
-        ti.atomic_add(sums[at + step], ti.round(weight * value / QUANTUM, ti.i64))
+        part, step = weight(cells, offset, n)
+        ti.atomic_add(sums[at + step], ti.round(part * value / QUANTUM, ti.i64))
 
 
 @func
@@ -207,11 +186,11 @@ def _ask_air(box: Box, cloth: Hanging, faces: Faces, node_velocity: Vectors, nod
             for axis, face, sums in ti.static(
                 ((0, faces.x, box.sums.x), (1, faces.y, box.sums.y), (2, faces.z, box.sums.z))
             ):
-                at, offset = _corner(box.cells, cloth.place[t], axis)
+                at, offset = corner(box.cells, cloth.place[t], axis)
                 for n in ti.static(range(8)):
-                    weight, step = _weight(box.cells, offset, n)
-                    air[axis] += weight * face[at + step]
-                    reach[axis] += weight * (ti.cast(sums[at + step], ti.f32) * QUANTUM)
+                    part, step = weight(box.cells, offset, n)
+                    air[axis] += part * face[at + step]
+                    reach[axis] += part * (ti.cast(sums[at + step], ti.f32) * QUANTUM)
             cloth.velocity[t] = air
             cloth.inverse_mass[t] = reach.max()
             past = air

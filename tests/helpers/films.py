@@ -34,7 +34,7 @@ kill; only a hang gets here."""
 
 FRAMES = 6
 STAGE_NAMES = [
-    stage.name for stage in STAGES if stage.name not in ("animated", "soft", "bounds") and not stage.on_demand
+    stage.name for stage in STAGES if stage.name not in ("animated", "soft", "embers", "bounds") and not stage.on_demand
 ]
 """Those that the small films have: their cameras do not frame the action, and no file animates their bodies."""
 ARTIFACT_SUFFIXES = {".h5", ".ply", ".vdb", ".png", ".mp4"}

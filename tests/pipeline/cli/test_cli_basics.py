@@ -105,7 +105,7 @@ def test_warnings_go_to_the_error_stream(in_tmp_path):
     assert result.exit_code == 0
     assert (
         result.stderr
-        == "warning: still.toml: has no [[fluid]], [[cloth]], [[soft]] or [[smoke]], so nothing will move\n"
+        == "warning: still.toml: has no [[fluid]], [[cloth]], [[soft]], [[smoke]] or [[embers]], so nothing will move\n"
     )
     assert result.stdout.startswith("still.toml: ok\n")
 

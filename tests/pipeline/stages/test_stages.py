@@ -50,6 +50,7 @@ def test_every_frame_gets_its_surface_volume_and_picture():
         "animated": 0,
         "soft": 0,
         "volume": 40,
+        "embers": 0,
         "whitewater": 0,
         "bounds": 0,
         "render": 40,

@@ -174,7 +174,7 @@ def test_touching_bodies_may_start_and_kinematic_ones_may_overlap_static_ones():
 
 def test_smoke_by_the_name_of_the_moving_bodies_is_refused():
     smoke = {"name": "rigid", "source": [{"shape": ball(0.1)}]}
-    with pytest.raises(ValueError, match="name the fluid or smoke otherwise"):
+    with pytest.raises(ValueError, match="name the fluid, smoke or embers otherwise"):
         build_world(SceneParameters(rigid=tumbling_scene().rigid, smoke=(smoke,)), frames_per_second=60)
 
 

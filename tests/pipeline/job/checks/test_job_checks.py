@@ -80,14 +80,14 @@ def test_of_numbers_of_usual_size_no_unit_is_asked_for(monkeypatch):
 
 def test_a_job_without_a_body_is_refused(tmp_path):
     assert checked(HEAD, tmp_path / "dam.toml").errors == [
-        "dam.toml: has no body; add [[rigid]], [[fluid]], [[cloth]], [[soft]] or [[smoke]]"
+        "dam.toml: has no body; add [[rigid]], [[fluid]], [[cloth]], [[soft]], [[smoke]] or [[embers]]"
     ]
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (BALL, ": has no [[fluid]], [[cloth]], [[soft]] or [[smoke]], so nothing will move"),
+        (BALL, ": has no [[fluid]], [[cloth]], [[soft]], [[smoke]] or [[embers]], so nothing will move"),
         (WATER.replace("0.5]", "0.0]"), ":7 fluid[0].block[0]: 50 % of it are outside the domain"),
         (WATER.replace("particle_radius", "dt = 0.01\nparticle_radius"), ":6 fluid[0].dt: 0.01 s ... 0.00025 s"),
         (

@@ -1,0 +1,1 @@
+"""Embers: glowing particles that the air of a smoke carries."""
