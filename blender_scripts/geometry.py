@@ -18,6 +18,7 @@ REST_UV = "rest"
 PICTURE_UV = "UVMap"  # UV map of coordinates on pictures, by Blender's usual name: the one that image textures follow
 WET = "wet"  # attribute that tells where a fluid touches solids: 1 there, 0 where its surface is free (`wetting`)
 DYE = "dye"  # attribute of a fluid's concentration of dye [-]
+EMBER_TEMPERATURE = "ember_temperature"  # attribute [K]; "temperature" and "heat" are grids of volumes to Cycles
 DYE_BEHIND = "dye_behind"  # attribute of how deep dye lies behind its surface [m]
 COVERED = "covered"  # attribute of what light goes through: above 1/2 where a liquid covers it (`wetting`)
 COVER_INDEX = "cover_index"  # and that liquid's refractive index, less 1

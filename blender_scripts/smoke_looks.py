@@ -6,6 +6,7 @@ from typing import Any
 
 from blender_scripts.black_body import LUMINANCE_EXPONENT_K
 from blender_scripts.flames import Glow
+from blender_scripts.geometry import EMBER_TEMPERATURE
 from blender_scripts.shading import Color, LookContext, NodeBuilder, SmokeBox, draws, or_default
 
 _EDGE_FADE = 0.08  # width of the fade at open faces, in shortest edges of the box
@@ -47,7 +48,7 @@ def _fire(builder: NodeBuilder, context: LookContext) -> None:
 def _embers(builder: NodeBuilder, context: LookContext) -> None:
     """Char that glows as a black body does, as bright as thick flames of its temperature are in the look `fire`."""
     reference = or_default(context.flame_temperature, DEFAULT_FLAME_TEMPERATURE_K)
-    luminance, color = _black_body(builder, _grid(builder, "temperature"), reference)
+    luminance, color = _black_body(builder, _grid(builder, EMBER_TEMPERATURE), reference)
     emission = or_default(context.emission, DEFAULT_EMISSION)
     glow = builder.node("ShaderNodeEmission", Color=color, Strength=builder.math("MULTIPLY", luminance, emission))
     builder.surface(glow)
@@ -113,7 +114,7 @@ def _fade_width(context: LookContext) -> float:
 
 
 def _grid(builder: NodeBuilder, name: str) -> Any:
-    """The output socket of a grid's value."""
+    """The output socket of the value of a grid, or of an attribute of points."""
     attribute = builder.node("ShaderNodeAttribute")
     attribute.attribute_name = name
     return attribute.outputs[2]  # `Fac`, from 5.0 on `Factor`

@@ -36,10 +36,10 @@ class EmberParameters(Parameters):
     name: BodyName = Field(description="Name of the embers, unique in the job.")
     smoke: str = Field(description="Name of the smoke whose air carries them; outside of its box air is at rest.")
     source: tuple[EmberSourceParameters, ...] = Field(min_length=1, description="Where they come from.")
-    diameter: Positive = Field(default=0.001, le=0.05, description="Mean diameter [m]; from half to one and a half.")
-    density: Positive = Field(default=100.0, description="Density of the char [kg/m³].")
+    diameter: Positive = Field(default=0.0015, le=0.05, description="Mean diameter [m]; from half to one and a half.")
+    density: Positive = Field(default=50.0, description="Density of the porous char [kg/m³].")
     temperature: Annotated[float, Field(gt=COLD_K, le=2500.0)] = Field(
-        default=1400.0,
+        default=1550.0,
         description="Temperature at the start [K]; it sinks to 800 K, where nothing glows, slowly at first.",
     )
     lifetime: Positive = Field(

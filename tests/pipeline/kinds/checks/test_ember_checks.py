@@ -35,7 +35,7 @@ position = [0.0, 0.0, 0.2]
         ("embers.sparks.source.0.start_s=2", True, "start_s: is 2 s; the film ends at 1 s"),
         (
             "embers.sparks.source.0.position=[0,0,0.9]",
-            0,
+            True,
             'is outside of the box of "fire", where no air carries embers',
         ),
         ("embers.sparks.source.0.rate=1e6", False, "rate"),
