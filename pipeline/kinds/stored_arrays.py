@@ -25,6 +25,7 @@ _UNITS = {
     "pressure": "Pa",
     "temperature": "K",
     "uv": "m",
+    "diameter": "m",
 }
 _UNITS_BY_KIND = {("fluid", "density"): "kg/m3"}
 

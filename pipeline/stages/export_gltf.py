@@ -10,6 +10,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
 from pipeline.kinds.rigid import meshes_at_rest
+from pipeline.kinds.soft import is_grainy
 from pipeline.kinds.table import products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
@@ -36,13 +37,15 @@ class GltfExport(ExportStage):
         return ArtifactPath(f"{job.name}.glb")
 
     def left_out(self, job: Job) -> list[str]:
-        """Smoke, drops, whitewater, a zoom."""
+        """Smoke, drops, whitewater, grains, embers, a zoom."""
         keyframes = job.camera.keyframe
         lengths = {key.focal_length_mm or job.camera.focal_length_mm for key in keyframes}
         return [
             *(f"smoke ({each.name})" for each in job.smoke),
             *(f"drops ({each.name})" for each in (job.fluid if job.surface.drops_per_particle else ())),
             *(f"whitewater ({name})" for name in job.whitewater),
+            *(f"grains ({each.name})" for each in job.soft if is_grainy(each)),
+            *(f"embers ({each.name})" for each in job.embers),
             *(["the camera's zoom"] if len(lengths) > 1 else []),
         ]
 

@@ -117,9 +117,12 @@ class _Frame:
             write_blocks(path, [(name, str(artifact).removeprefix(f"{FOLDER}/")) for name, artifact in blocks])
 
     def _writers(self) -> Iterator[tuple[str, Callable[[Path], None]]]:
-        of_form = {"points": self._points, "mesh": self._mesh, "parts": self._parts, "density": self._cells}
+        of_form = {"mesh": self._mesh, "parts": self._parts, "density": self._cells}
         for _, kind, body in bodies(self._job):
-            yield body.name, partial(of_form[kind.display.form], body=body)
+            if kind.display.form == "points":
+                yield body.name, partial(self._points, body=body, radius=kind.display.radius)
+            else:
+                yield body.name, partial(of_form[kind.display.form], body=body)
             if kind.name == "fluid":
                 yield f"{body.name}.surface", partial(self._surface, name=body.name)
                 drops = self._layout.drops(body.name, self._frame)
@@ -128,13 +131,13 @@ class _Frame:
                 whitewater = self._layout.whitewater(body.name, self._frame)
                 yield f"{body.name}.whitewater", partial(self._cloud, file=whitewater, fades=True)
 
-    def _points(self, path: Path, *, body: Any) -> None:
+    def _points(self, path: Path, *, body: Any, radius: str) -> None:
         snapshot = read_compact(self._cache, body.name)
         arrays = dict(snapshot.arrays)
         position = arrays.pop("position")
         values = {key: Values(array, unit_of(snapshot.kind, key)) for key, array in arrays.items()}
-        radius = np.full(len(position), snapshot.number("particle_radius"), np.float32)
-        write_polydata(path, position, point_values={**values, "radius": Values(radius, "m")}, time_s=self._time_s)
+        radii = np.full(len(position), snapshot.number(radius), np.float32)
+        write_polydata(path, position, point_values={**values, "radius": Values(radii, "m")}, time_s=self._time_s)
 
     def _mesh(self, path: Path, *, body: Any) -> None:
         snapshot = read_compact(self._cache, body.name)

@@ -16,6 +16,15 @@ name = "duck"
 shape = { type = "duck", length = 0.12 }
 position = [-0.2, -0.18, 0.06]
 
+[[embers]]
+name = "sparks"
+smoke = "plume"
+
+[[embers.source]]
+shape = { type = "sphere", radius = 0.05 }
+position = [0.0, 0.0, 0.2]
+rate = 600.0
+
 [camera]
 position = [0.7, -1.2, 0.7]
 """
@@ -25,5 +34,7 @@ position = [0.7, -1.2, 0.7]
 def simulated(folder: Path) -> Studio:
     """A studio whose job is simulated, and nothing is drawn."""
     studio = Studio.open(folder, EVERYTHING)
-    studio.submit("--until", "surface", "--until", "cloth", "--until", "volume", "--until", "whitewater")
+    studio.submit(
+        "--until", "surface", "--until", "cloth", "--until", "volume", "--until", "whitewater", "--until", "embers"
+    )
     return studio

@@ -96,7 +96,7 @@ def points(block: Any) -> np.ndarray:
 
 def test_vtk_reads_what_the_cache_has(vtk):
     blocks = blocks_of(vtk.layout.root / f"vtk/{LAST:06d}.vtm")
-    names = {"ball", "duck", "water", "water.surface", "water.drops", "water.whitewater", "sheet", "plume"}
+    names = {"ball", "duck", "water", "water.surface", "water.drops", "water.whitewater", "sheet", "plume", "sparks"}
     assert blocks.keys() == names
     for body in ("water", "sheet"):
         there = cached(vtk, body, LAST).arrays
@@ -106,6 +106,10 @@ def test_vtk_reads_what_the_cache_has(vtk):
     assert blocks["water.surface"].GetNumberOfCells() == len(mesh.faces)
     np.testing.assert_array_equal(array(blocks["water.surface"].GetPointData(), "velocity"), mesh.velocities)
     np.testing.assert_array_equal(array(blocks["water.whitewater"].GetPointData(), "kind"), cloud.kind)
+    sparks = cached(vtk, "sparks", LAST).arrays
+    assert len(sparks["temperature"]) > 20
+    np.testing.assert_array_equal(points(blocks["sparks"]), sparks["position"])
+    np.testing.assert_array_equal(array(blocks["sparks"].GetPointData(), "temperature"), sparks["temperature"])
 
 
 def test_vtk_reads_drops_with_radii_and_dye_of_the_surface(tmp_path):
