@@ -74,6 +74,27 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [by_nodeid[nodeid] for nodeid in in_order_of_families(list(by_nodeid))]
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Name what fails as it fails: a run that is broken off has no summary."""
+    reporter = config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is not None and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(FailuresAsTheyCome(reporter))
+
+
+class FailuresAsTheyCome:
+    """Writes a line for each failure where tests run in processes of their own, whose lines tell no names."""
+
+    def __init__(self, reporter: Any) -> None:
+        self._reporter = reporter
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """A phase of a test has ended."""
+        if report.failed and hasattr(report, "node"):
+            self._reporter.ensure_newline()
+            self._reporter.write_line(f"failed after {report.duration:.0f} s: {report.nodeid}")
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Keep families in one process, too, where files are asked to be, and their order as it was collected."""
