@@ -11,7 +11,7 @@ from sim.cloth.solver import SOLVER_NAME as CLOTH_NAME
 from sim.cloth.solver import ClothSolver
 from sim.core.solver import Coupling, Solver
 from sim.core.world import World
-from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
+from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed, expected_soft_speed
 from sim.coupling.cloth_fluid import ClothFluidCoupling, ClothSamples
 from sim.coupling.cloth_joints import ClothJointsCoupling, passing_of, points_of_joints
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
@@ -22,6 +22,7 @@ from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
+from sim.coupling.soft_fluid import SoftFluidCoupling, samples_of_soft, too_coarse
 from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.emitter import Carrier
@@ -83,12 +84,13 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     sewn = any(cloth.name in joint.between for joint in scene.joint for cloth in scene.cloth)
     nodes, points = points_of_joints(scene.joint, cloths[0], frames_per_second) if sewn else (None, None)
     rigid = _build_rigid(scene, points, forces)
+    softs = [_build_soft(scene, static, forces)] if scene.soft else []
     samples = None
     if cloths and scene.fluid:
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
-    fluids = [_build_fluids(scene, static, rigid, samples, forces)] if scene.fluid else []
+    around = static, rigid, samples, next(iter(softs), None)
+    fluids = [_build_fluids(scene, *around, forces)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, static, forces, 1.0 / frames_per_second) for smoke in scene.smoke]
-    softs = [_build_soft(scene, static, forces)] if scene.soft else []
     coupled: list[Solver] = [*fluids, *cloths, *softs, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
@@ -101,7 +103,8 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
             couplings.append(ClothJointsCoupling(cloth, rigid, nodes, passing))
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     for soft in softs:
-        soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static)
+        couplings += [SoftFluidCoupling(fluid, soft) for fluid in fluids]
+        soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static, mass=soft.mass + _most_mass(fluids))
         if rigid is not None and soft.contacts is not None:
             couplings.append(SoftRigidCoupling(soft, rigid, soft.contacts))
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
@@ -133,6 +136,7 @@ def _build_fluids(
     static: Sequence[StaticBody],
     rigid: RigidSolver | None,
     cloth: ClothSamples | None,
+    soft: SoftSolver | None,
     forces: ForceField | None,
 ) -> SPHFluid:
     """One solver for all fluids, as they share the tank; of what moves it has the samples."""
@@ -148,8 +152,12 @@ def _build_fluids(
     fluids = with_emitters_on(scene.fluid, scene.rigid)
     followed = {body.name: body for body in movers}
     _check_openings(fluids, scene, solids, followed, spacing, volume)
+    if coarse := too_coarse(scene.soft, spacing):
+        raise ValueError(f'soft "{scene.soft[0].name}": cell_size {coarse}')
+    solids += [build_solid(block, shapes) for each in scene.soft for block in each.block]
     filling = fill_fluids(fluids, scene.domain, solids, None if cloth is None else (cloth.start, cloth.normals))
     speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]
+    speeds += [] if soft is None else [expected_soft_speed(soft, scene.domain)]
     speeds += [] if cloth is None else [expected_cloth_speed(scene.cloth, cloth.start, scene.domain, scene.gravity)]
     samples = [
         sink_samples(
@@ -174,7 +182,7 @@ def _build_fluids(
         dye=filling.dye,
         boundary=BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples),
         moving=BoundarySamples.of_bodies() if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
-        sheets=None if cloth is None else cloth.sheets,
+        sheets=samples_of_soft(soft) if soft is not None else None if cloth is None else cloth.sheets,
         body_count=len(movers),
         body_speed=max(speeds, default=0.0),
         followed=followed,
@@ -183,6 +191,11 @@ def _build_fluids(
         forces=forces,
     )
     return SOLVERS[scene.fluid[0].solver](start)
+
+
+def _most_mass(fluids: Sequence[SPHFluid]) -> float:
+    """Of all the fluid that there can ever be [kg]."""
+    return sum(f.particles.capacity * f.particle_volume * float(f.phases.rest_densities.max()) for f in fluids)
 
 
 def _check_openings(

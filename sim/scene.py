@@ -37,7 +37,8 @@ class SceneParameters(Parameters):
         default=(), description="Cloths; they collide with each other, and share the keys that say how they step."
     )
     soft: tuple[SoftParameters, ...] = Field(
-        default=(), description="Sand, snow, jelly and clay; they share a grid, and meet walls and rigid bodies."
+        default=(),
+        description="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies and fluids.",
     )
     force: Annotated[tuple[Force, ...], Field(max_length=MOST_FORCES)] = Field(
         default=(), description="Forces from outside, and moving air, that act on all bodies, or on some."
@@ -82,11 +83,12 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_soft_matter_among_bodies(self) -> Self:
-        """Soft matter has couplings with rigid bodies alone, and would pass through the others."""
-        for name, there in (("fluid", self.fluid), ("cloth", self.cloth), ("smoke", self.smoke)):
+        """Soft matter has couplings with rigid bodies and fluids, and would pass through the others."""
+        for name, there in (("cloth", self.cloth), ("smoke", self.smoke)):
             if self.soft and there:
                 raise KeyRefusedError(
-                    ("soft", 0), f"meets walls and rigid bodies, and would pass through {name}; remove one of both"
+                    ("soft", 0),
+                    f"meets walls, rigid bodies and fluids, and would pass through {name}; remove one of both",
                 )
         return self
 

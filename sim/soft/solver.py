@@ -30,6 +30,7 @@ from sim.soft.transfers import (
     COUNTS,
     MAXIMA,
     SHARES,
+    Load,
     Nodes,
     Particles,
     Shares,
@@ -66,6 +67,9 @@ class SoftSolver:
         gravity: [m/s²]; may be changed between frames.
         contacts: rigid bodies that soft matter meets; None where there are none.
         particles: for kernels.
+        load: what touches the particles in the next step; none before `let_touch`.
+        masses: of a particle of each body [kg], (bodies,), on the device.
+        volume: of a particle at rest [m³].
         mass: of all particles at the start [kg].
 
     Raises:
@@ -95,7 +99,8 @@ class SoftSolver:
         self.particles = Particles(
             on_device(position), on_device(velocity), *matrices, ti.ndarray(ti.f32, n), on_device(body), n
         )
-        self._masses, self._volume = on_device(particle_mass), volume
+        self.masses, self.volume = on_device(particle_mass), volume
+        self._load_particles(0)
         self._laws = laws_of(self.parameters)
         self._grid = BlockGrid(domain, self.parameters[0].cell_size, n)
         self._make_nodes()
@@ -105,6 +110,14 @@ class SoftSolver:
         self.contacts: BodyContacts | None = None
         self._started = n
         self._measure()
+
+    def let_touch(self) -> None:
+        """Make room for what touches particles, which whoever couples them gives before each step."""
+        self._load_particles(self.particles.count)
+
+    def _load_particles(self, count: int) -> None:
+        arrays = ti.ndarray(ti.f32, max(count, 1)), ti.Vector.ndarray(3, ti.f32, max(count, 1))
+        self.load = Load(*arrays, there=count > 0)
 
     def _make_nodes(self) -> None:
         room = self._grid.blocks.room * NODES
@@ -139,7 +152,7 @@ class SoftSolver:
         if grid.sort(particles.position, particles.body):
             self._make_nodes()
         blocks, stored = grid.blocks, grid.count
-        given = self._masses, self._volume, self._shares, self._nodes, ti.math.vec3(self.gravity)
+        given = self.masses, self.volume, self.load, self._shares, self._nodes, ti.math.vec3(self.gravity)
         particles_to_grid(blocks, stored, particles, *given, dt)
         if self.contacts is not None:
             self.contacts.resolve(blocks, stored, self._nodes, dt)
@@ -204,7 +217,7 @@ class SoftSolver:
         """Momentum, energies and sizes."""
         body = copied(self.particles.body)
         inside = body >= 0
-        mass = copied(self._masses)[body[inside]].astype(np.float64)
+        mass = copied(self.masses)[body[inside]].astype(np.float64)
         position, velocity = (
             copied(array)[inside].astype(np.float64) for array in (self.particles.position, self.particles.velocity)
         )
