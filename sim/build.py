@@ -22,7 +22,7 @@ from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
-from sim.coupling.soft_fluid import SoftFluidCoupling, samples_of_soft, too_coarse
+from sim.coupling.soft_fluid import SoftFluidCoupling, samples_of_soft
 from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.emitter import Carrier
@@ -42,6 +42,7 @@ from sim.rigid.states import StaticBody
 from sim.shapes.placement import SharedShapes, build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.smoke.solver import SmokeSolver
+from sim.soft.parameters import coarse_for_fluid
 from sim.soft.solver import SOLVER_NAME as SOFT_NAME
 from sim.soft.solver import SoftSolver
 
@@ -152,8 +153,9 @@ def _build_fluids(
     fluids = with_emitters_on(scene.fluid, scene.rigid)
     followed = {body.name: body for body in movers}
     _check_openings(fluids, scene, solids, followed, spacing, volume)
-    if coarse := too_coarse(scene.soft, spacing):
-        raise ValueError(f'soft "{scene.soft[0].name}": cell_size {coarse}')
+    for each in scene.soft:
+        if coarse := coarse_for_fluid(each, spacing):
+            raise ValueError(f'soft "{each.name}": cell_size {coarse}')
     solids += [build_solid(block, shapes) for each in scene.soft for block in each.block]
     filling = fill_fluids(fluids, scene.domain, solids, None if cloth is None else (cloth.start, cloth.normals))
     speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]

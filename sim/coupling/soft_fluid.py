@@ -1,7 +1,6 @@
 """Two-way coupling of soft matter and the particle fluid that it is in: each of its particles is a sample of it."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import taichi as ti
@@ -16,22 +15,10 @@ from sim.fluid.boundary import Samples, Sheets
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.sheets import SheetSamples
-from sim.soft.parameters import SoftParameters
 from sim.soft.solver import SoftSolver
 from sim.soft.transfers import Load, Particles
 
 MAXIMA = 3
-COARSEST = 1.25  # distance of particles of soft matter over that of a fluid's, beyond which fluid gets in between
-
-
-def too_coarse(soft: Sequence[SoftParameters], spacing: float) -> str | None:
-    """Why a fluid of particles at this spacing [m] would get into soft matter, in words; None where it does not."""
-    if not soft or soft[0].spacing <= COARSEST * spacing:
-        return None
-    return (
-        f"is {soft[0].cell_size:g} m, too coarse to hold particles of fluid {spacing:g} m apart; use "
-        f"{2.0 * COARSEST * spacing:.2g} m or less, or a larger fluid.particle_radius"
-    )
 
 
 def samples_of_soft(soft: SoftSolver) -> SheetSamples:

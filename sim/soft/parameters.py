@@ -115,6 +115,21 @@ class SoftParameters(Parameters):
         return self.cfl * WAVE_NUMBER * self.cell_size / self.wave_speed
 
 
+COARSEST = 1.25
+"""Distance of particles of soft matter over that of a fluid's beyond which fluid gets in between."""
+
+
+def coarse_for_fluid(soft: SoftParameters, spacing: float) -> str | None:
+    """Why a fluid of particles at a spacing [m] would get into a soft body, in words that follow its cell_size."""
+    if soft.spacing <= COARSEST * spacing:
+        return None
+    most = PARTICLES_PER_CELL_EDGE * COARSEST * spacing
+    return (
+        f"of {soft.cell_size:g} m would let fluid through, whose particles are {spacing:g} m apart; "
+        f"use {most:.3g} m or less"
+    )
+
+
 SHARED_KEYS = ("cell_size", "friction", "cfl")
 """Keys that all soft bodies of a job share, as they share a grid and its steps."""
 

@@ -11,12 +11,16 @@ from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 from sim.shapes.filled_volume import Surroundings, amount
 from sim.shapes.placement import PlacedSolid
-from sim.soft.parameters import SoftParameters, shared_conflicts
+from sim.soft.parameters import SoftParameters, coarse_for_fluid, shared_conflicts
 
 BYTES_PER_PARTICLE = 560
 """Of the solver with the nodes around a particle, and the snapshots and checkpoints that wait to be written."""
+BYTES_BESIDE_FLUID = 300
+"""Of a particle as a sample that fluid feels, on top."""
 FEWEST_CELLS = 3.0
 """Cells across a body, or a block, below which it is told: fewer bend, and are met, in no way that means much."""
+FINEST = 0.4
+"""Distance of particles over that of a fluid's below which it is told."""
 SHORTEST_STEP_S = 2.0e-6
 
 
@@ -48,8 +52,11 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
                 )
             filled.append(solid)
             total += particles
-    if refusal := budget.refusal(total, "particles of soft matter", BYTES_PER_PARTICLE):
+    each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0)
+    if refusal := budget.refusal(total, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
+    if job.soft and job.fluid:
+        _check_fluid(job.soft[0], job.fluid[0].spacing, findings)
     if job.soft:
         _check_bodies(solids, job.soft[0].cell_size, findings)
     return total
@@ -64,6 +71,21 @@ def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings)
             f"{soft.value('young_modulus'):.3g} Pa need steps of {step:.2g} s, "
             f"{rounded_up(1.0 / (job.fps * step)):,.0f} a frame; "
             f"{soft.value('young_modulus') * (step / SHORTEST_STEP_S) ** 2:.2g} Pa or less would do, or larger cells",
+        )
+
+
+def _check_fluid(soft: SoftParameters, spacing: float, findings: Findings) -> None:
+    """Refuse cells that fluid of a spacing [m] would slip through, and warn of so fine ones that it gets slow."""
+    path = ("soft", 0, "cell_size")
+    if coarse := coarse_for_fluid(soft, spacing):
+        findings.error(path, coarse)
+    elif soft.spacing < FINEST * spacing:
+        felt = round(2.0 / 3.0 * np.pi * (2.0 * spacing / soft.spacing) ** 3)
+        findings.warn(
+            path,
+            f"of {soft.cell_size:g} m is far finer than the fluid, whose particles are {spacing:g} m apart: each of "
+            f"these feels some {felt} of soft matter where they touch; use {2.0 * spacing:.2g} m, or a smaller "
+            "fluid.particle_radius",
         )
 
 

@@ -66,7 +66,6 @@ def test_what_is_too_thin_for_the_grid_is_told_with_the_cells_that_would_do(tmp_
 @pytest.mark.parametrize(
     ("other", "table"),
     [
-        ("fluid", '[[fluid]]\nname = "water"\n[[fluid.block]]\nshape = { type = "sphere", radius = 0.1 }\n'),
         ("cloth", '[[cloth]]\nname = "sheet"\nshape = { type = "rectangle", size = [0.3, 0.3], resolution = 0.05 }\n'),
         ("smoke", '[[smoke]]\nname = "fog"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.1 }\n'),
     ],
@@ -74,4 +73,22 @@ def test_what_is_too_thin_for_the_grid_is_told_with_the_cells_that_would_do(tmp_
 def test_a_kind_that_it_would_pass_through_is_refused_by_name(tmp_path, other, table):
     code, output = told(tmp_path, JOB + table)
     assert code == 2
-    assert f"soft[0]: meets walls and rigid bodies, and would pass through {other}; remove one of both" in output
+    assert (
+        f"soft[0]: meets walls, rigid bodies and fluids, and would pass through {other}; remove one of both" in output
+    )
+
+
+def test_cells_are_told_that_fluid_slips_through_or_that_are_far_finer_than_it(tmp_path):
+    fluid = '[[fluid]]\nname = "water"\nparticle_radius = 0.01\n[[fluid.block]]\n'
+    pool = JOB + fluid + 'shape = { type = "box", size = [1.0, 1.0, 0.1] }\nposition = [0.0, 0.0, 0.05]\n'
+    code, output = told(tmp_path, pool, "--set", "soft.jelly.cell_size=0.04")
+    assert code == 0
+    assert "warning" not in output  # water makes room for the jelly in it
+    code, output = told(tmp_path, pool, "--set", "soft.jelly.cell_size=0.06")
+    assert code == 2
+    assert (
+        "cell_size: of 0.06 m would let fluid through, whose particles are 0.02 m apart; use 0.05 m or less" in output
+    )
+    code, output = told(tmp_path, pool, "--set", "soft.jelly.cell_size=0.015")
+    assert code == 0
+    assert "each of these feels some 318 of soft matter where they touch; use 0.04 m" in output
