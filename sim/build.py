@@ -108,7 +108,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static, mass=soft.mass + _most_mass(fluids))
         if rigid is not None and soft.contacts is not None:
             couplings.append(SoftRigidCoupling(soft, rigid, soft.contacts))
-    couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
+    couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, softs=softs, rigid=rigid)
     standing = {body.name: body.snapshot() for body in static}
     return World(
         [*coupled, *solvers],
@@ -279,16 +279,16 @@ def _build_smoke(
         domain=scene.domain,
         gravity=scene.gravity,
         solids=[body.solid for body in static],
-        moving=_meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
+        moving=_meets_particles(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
         forces=forces,
         frame_s=frame_s,
     )
 
 
-def _meets_fluid(smoke: SmokeParameters, scene: SceneParameters) -> bool:
-    """Whether fluid, which stays in the domain, could come into the smoke's box."""
+def _meets_particles(smoke: SmokeParameters, scene: SceneParameters) -> bool:
+    """Whether fluid or soft matter, which stay in the domain, could come into the smoke's box."""
     domain = scene.domain
-    return bool(scene.fluid) and boxes_overlap(smoke.corners(domain), (domain.min, domain.max))
+    return bool(scene.fluid or scene.soft) and boxes_overlap(smoke.corners(domain), (domain.min, domain.max))
 
 
 def _couple_smokes(
@@ -297,6 +297,7 @@ def _couple_smokes(
     *,
     fluids: Sequence[SPHFluid],
     cloths: Sequence[ClothSolver],
+    softs: Sequence[SoftSolver],
     rigid: RigidSolver | None,
 ) -> list[Coupling]:
     """Each smoke with what is in its way, which is put there, and with what hangs in it."""
@@ -307,8 +308,8 @@ def _couple_smokes(
         for body, reason in too_thin_bodies(smoke.parameters, moving, solids, scene.domain):
             raise ValueError(f'"{moving[body].name}" {reason}')
         in_the_way: list[Coupling] = []
-        if _meets_fluid(smoke.parameters, scene):
-            in_the_way += [SmokeFluidCoupling(fluid, smoke, domain=scene.domain) for fluid in fluids]
+        if _meets_particles(smoke.parameters, scene):
+            in_the_way += [SmokeFluidCoupling(each, smoke, domain=scene.domain) for each in (*fluids, *softs)]
         in_the_way += [] if rigid is None else [SmokeRigidCoupling(rigid, smoke)]
         for coupling in in_the_way:
             coupling.exchange(0.0)

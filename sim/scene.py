@@ -38,7 +38,7 @@ class SceneParameters(Parameters):
     )
     soft: tuple[SoftParameters, ...] = Field(
         default=(),
-        description="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies and fluids.",
+        description="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies, fluids and smoke.",
     )
     force: Annotated[tuple[Force, ...], Field(max_length=MOST_FORCES)] = Field(
         default=(), description="Forces from outside, and moving air, that act on all bodies, or on some."
@@ -83,13 +83,12 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_soft_matter_among_bodies(self) -> Self:
-        """Soft matter has couplings with rigid bodies and fluids, and would pass through the others."""
-        for name, there in (("cloth", self.cloth), ("smoke", self.smoke)):
-            if self.soft and there:
-                raise KeyRefusedError(
-                    ("soft", 0),
-                    f"meets walls, rigid bodies and fluids, and would pass through {name}; remove one of both",
-                )
+        """Soft matter has no coupling with cloth, and would pass through it."""
+        if self.soft and self.cloth:
+            raise KeyRefusedError(
+                ("soft", 0),
+                "meets walls, rigid bodies, fluids and smoke, and would pass through cloth; remove one of both",
+            )
         return self
 
     @model_validator(mode="after")
@@ -105,7 +104,8 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_whole_boxes_beside_others(self) -> Self:
-        other = "fluid" if self.fluid else "cloth" if self.cloth else None
+        others = {"fluid": self.fluid, "cloth": self.cloth, "soft matter": self.soft}
+        other = next((name for name, there in others.items() if there), None)
         for number, smoke in enumerate(self.smoke):
             if smoke.grid != "box" and other is not None:
                 raise KeyRefusedError(

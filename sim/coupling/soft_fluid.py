@@ -79,7 +79,7 @@ class SoftFluidCoupling(Coupling):
         self._fluid.tank.sheets_moved(distance, speed, elapsed_s=dt)
 
     def resume(self) -> None:
-        """Put the samples where the particles are, without volume where these have left."""
+        """Put the samples where the particles are."""
         boundary = self._fluid.boundary
         place_particles(self._soft.particles, boundary.samples, boundary.sheets)
 
@@ -114,11 +114,8 @@ def measure_particles(particles: Particles, samples: Samples, sheets: Sheets, ch
 
 @kernel
 def place_particles(particles: Particles, samples: Samples, sheets: Sheets):
-    """Samples where the particles are, as fast as these; without volume where they have left."""
+    """Samples where the particles are, as fast as these."""
     for p in range(particles.count):
         s = sheets.first + p
         samples.position[s] = particles.position[p]
         samples.velocity[s] = particles.velocity[p]
-        if particles.body[p] < 0:
-            samples.volume[s] = 0.0
-            samples.friction_volume[s] = 0.0

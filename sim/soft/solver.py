@@ -69,7 +69,7 @@ class SoftSolver:
         particles: for kernels.
         load: what touches the particles in the next step; none before `let_touch`.
         masses: of a particle of each body [kg], (bodies,), on the device.
-        volume: of a particle at rest [m³].
+        spacing, volume: of particles at rest [m, m³].
         mass: of all particles at the start [kg].
 
     Raises:
@@ -99,6 +99,7 @@ class SoftSolver:
         self.particles = Particles(
             on_device(position), on_device(velocity), *matrices, ti.ndarray(ti.f32, n), on_device(body), n
         )
+        self.spacing = self.parameters[0].spacing
         self.masses, self.volume = on_device(particle_mass), volume
         self._load_particles(0)
         self._laws = laws_of(self.parameters)

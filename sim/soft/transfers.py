@@ -37,11 +37,12 @@ SHARES = SUPPORT**3
 WARP = 32  # threads of a GPU that read together
 APIC = 4.0  # over h², the inverse of the splines' second moment
 MAXIMA, COUNTS = 2, 1  # of `measure`
+AWAY = 1.0e9  # coordinate of what has left, where it is in no one's way [m]
 
 
 @bundle
 class Particles(NamedTuple):
-    """Particles, (n,) each; body -1 has left."""
+    """Particles, (n,) each; body -1 has left, and is far away."""
 
     position: Vectors  # [m]
     velocity: Vectors  # [m/s]
@@ -225,6 +226,7 @@ def grid_to_particles(
         particles.position[p] = moved
         if (moved < box.keep_low).any() or (moved > box.keep_high).any():
             particles.body[p] = -1
+            particles.position[p] = ti.math.vec3(AWAY)
 
 
 @kernel
