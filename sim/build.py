@@ -22,6 +22,7 @@ from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
+from sim.coupling.soft_emitters import poured_by
 from sim.coupling.soft_fluid import SoftFluidCoupling, samples_of_soft
 from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
@@ -262,6 +263,7 @@ def _build_soft(scene: SceneParameters, static: Sequence[StaticBody], forces: Fo
         domain=scene.domain,
         gravity=scene.gravity,
         solids=[*(body.solid for body in static), *movers],
+        poured=poured_by(scene.soft),
         forces=forces,
     )
 

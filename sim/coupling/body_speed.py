@@ -61,6 +61,9 @@ def expected_cloth_speed(
 
 
 def expected_soft_speed(soft: SoftSolver, domain: DomainParameters) -> float:
-    """Largest speed [m/s] to expect of soft matter, as it starts: the initial one with a fall to the deepest corner."""
-    fastest = max(math.hypot(*block.velocity) for body in soft.parameters for block in body.block)
-    return math.sqrt(fastest**2 + square_of_fall_speed(copied(soft.particles.position), domain, soft.gravity))
+    """Largest speed [m/s] to expect of soft matter: that of its start or its emitters, with a fall from the highest."""
+    blocks = [math.hypot(*block.velocity) for body in soft.parameters for block in body.block]
+    fastest = max([*blocks, soft.poured.largest_speed])
+    places = copied(soft.particles.position)[copied(soft.particles.body) >= 0]
+    points = np.concatenate([places, soft.poured.position])
+    return math.sqrt(fastest**2 + square_of_fall_speed(points, domain, soft.gravity))

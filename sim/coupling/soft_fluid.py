@@ -25,7 +25,7 @@ def samples_of_soft(soft: SoftSolver) -> SheetSamples:
     """A sample for each particle, of its volume at rest."""
     particles = soft.particles
     points = BoundarySamples.of_points(copied(particles.position), known=soft.volume)
-    own_mass = copied(soft.masses)[copied(particles.body)].astype(np.float64)
+    own_mass = copied(soft.masses)[soft.owner].astype(np.float64)
     return SheetSamples(BoundarySamples.of_bodies(points), own_mass, np.zeros(particles.count))
 
 

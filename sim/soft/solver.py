@@ -26,6 +26,7 @@ from sim.soft.contact import BodyContacts, stop_at_walls
 from sim.soft.laws import Laws
 from sim.soft.materials import Law
 from sim.soft.parameters import SoftParameters, shared_conflicts
+from sim.soft.pouring import Poured, Pouring, has_come, waiting_rows
 from sim.soft.transfers import (
     COUNTS,
     MAXIMA,
@@ -70,7 +71,9 @@ class SoftSolver:
         load: what touches the particles in the next step; none before `let_touch`.
         masses: of a particle of each body [kg], (bodies,), on the device.
         spacing, volume: of particles at rest [m, m³].
-        mass: of all particles at the start [kg].
+        poured: what emitters let in.
+        owner: the body of each particle, whether it is there, has left or is to come, (n,), on the host.
+        mass: of all particles that there ever are [kg].
 
     Raises:
         ShapeError: a shape cannot be built.
@@ -84,6 +87,7 @@ class SoftSolver:
         domain: DomainParameters,
         gravity: Vector3,
         solids: Sequence[Solid] = (),
+        poured: Poured | None = None,
         forces: ForceField | None = None,
     ) -> None:
         self.name, self.parameters, self.gravity = SOLVER_NAME, tuple(parameters), gravity
@@ -91,10 +95,15 @@ class SoftSolver:
             number, key, message = conflicts[0]
             raise ValueError(f'soft "{self.parameters[number].name}": {key} {message}')
         position, velocity, body, volume = _filled(self.parameters, domain, solids)
+        self.poured = poured or Poured.together([])
+        self.owner = np.concatenate([body, self.poured.body])
+        self._pouring = Pouring(self.poured, len(position)) if len(self.poured.body) else None
+        rows = zip((position, velocity, body), waiting_rows(self.poured), strict=True)
+        position, velocity, body = (np.concatenate(each) for each in rows)
         n = len(position)
         density = np.array([each.value("density") for each in self.parameters])
         particle_mass = density * volume
-        self.mass = float(particle_mass[body].sum())
+        self.mass = float(particle_mass[self.owner].sum())
         matrices = [ti.Matrix.ndarray(3, 3, ti.f32, n) for _ in range(3)]
         self.particles = Particles(
             on_device(position), on_device(velocity), *matrices, ti.ndarray(ti.f32, n), on_device(body), n
@@ -109,7 +118,7 @@ class SoftSolver:
         self._forces = (forces or ForceField(())).on([(each.name,) for each in self.parameters])
         self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
         self.contacts: BodyContacts | None = None
-        self._started = n
+        self._time_s = 0.0
         self._measure()
 
     def let_touch(self) -> None:
@@ -143,11 +152,15 @@ class SoftSolver:
             for each in self.parameters
         )
         way = shared.cfl * MOTION_NUMBER * shared.cell_size
-        return min(by_waves, way / max(self._speed, math.sqrt(way * fall), TINY_SPEED))
+        speed = max(self._speed, 0.0 if self._pouring is None else self._pouring.largest_speed)
+        return min(by_waves, way / max(speed, math.sqrt(way * fall), TINY_SPEED))
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         particles, grid = self.particles, self._grid
+        if self._pouring is not None:
+            self._pouring.let_in(particles, self._time_s)
+        self._time_s += dt
         if self._forces.accelerates:
             push_particles(particles, self._forces.now, dt)
         if grid.sort(particles.position, particles.body):
@@ -162,7 +175,8 @@ class SoftSolver:
         self._measure()
 
     def begin_frame(self, time_s: float) -> None:
-        """Nothing is counted by frames."""
+        """Emitters go by the time of the frame."""
+        self._time_s = time_s
 
     # --- what others ask --------------------------------------------------------------------------------------------
 
@@ -212,6 +226,8 @@ class SoftSolver:
             if arrays[name].shape != expected:
                 raise ValueError(f"{name} of the checkpoint has shape {arrays[name].shape}, not {expected}")
             array.from_numpy(np.ascontiguousarray(arrays[name]))
+        if self._pouring is not None:
+            self._pouring.here = int(has_come(arrays["body"])[-self._pouring.count :].sum())
         self._measure()
 
     def diagnostics(self) -> Diagnostics:
@@ -225,7 +241,7 @@ class SoftSolver:
         momentum = mass @ velocity
         return {
             "particle_count": float(inside.sum()),
-            "particles_left": float(self._started - inside.sum()),
+            "particles_left": float((body == -1).sum()),
             "mass": float(mass.sum()),
             "max_speed": self._speed,
             "kinetic_energy": float(0.5 * mass @ (velocity**2).sum(axis=1)),
@@ -260,7 +276,7 @@ def _filled(
     """Positions [m], velocities [m/s] and bodies of the particles that fill all blocks, and the volume of each [m³]."""
     spacing = parameters[0].spacing
     positions, velocities = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
-    bodies: list[NDArray[np.int32]] = []
+    bodies = [np.empty(0, np.int32)]
     filled: list[Solid] = []
     for index, soft in enumerate(parameters):
         for number, block in enumerate(soft.block):

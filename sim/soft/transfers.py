@@ -42,7 +42,7 @@ AWAY = 1.0e9  # coordinate of what has left, where it is in no one's way [m]
 
 @bundle
 class Particles(NamedTuple):
-    """Particles, (n,) each; body -1 has left, and is far away."""
+    """Particles, (n,) each; body -1 has left, and those below wait; they are far away then."""
 
     position: Vectors  # [m]
     velocity: Vectors  # [m/s]

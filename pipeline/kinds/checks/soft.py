@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.checks.shapes import mesh_exists
 from pipeline.model.amounts import rounded_up
 from pipeline.model.job import Job
+from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from sim.coupling.soft_openings import opening_of
+from sim.fluid.opening_conflicts import obstruction
 from sim.shapes.filled_volume import Surroundings, amount
 from sim.shapes.placement import PlacedSolid
 from sim.soft.parameters import SoftParameters, coarse_for_fluid, shared_conflicts
@@ -52,6 +58,8 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
                 )
             filled.append(solid)
             total += particles
+        total += sum(round(each.emitted_volume(math.inf) / soft.spacing**3) for each in soft.emitter)
+        _check_emitters(job, index, walls, findings)
     each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0)
     if refusal := budget.refusal(total, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
@@ -72,6 +80,26 @@ def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings)
             f"{rounded_up(1.0 / (job.fps * step)):,.0f} a frame; "
             f"{soft.value('young_modulus') * (step / SHORTEST_STEP_S) ** 2:.2g} Pa or less would do, or larger cells",
         )
+
+
+def _check_emitters(job: Job, index: int, walls: list[PlacedSolid], findings: Findings) -> None:
+    """Refuse openings that are too narrow, outside the domain, or in bodies, and warn of those that come too late."""
+    soft = job.soft[index]
+    for number, emitter in enumerate(soft.emitter):
+        path: KeyPath = ("soft", index, "emitter", number)
+        if not mesh_exists(emitter.shape, path, findings):
+            continue
+        try:
+            opening = opening_of(emitter, soft.spacing)
+        except ValueError as error:
+            findings.error((*path, "shape"), str(error).replace("particle_radius", "cell_size"))
+            continue
+        if reason := obstruction(opening, soft.spacing, job.domain, walls):
+            findings.error(path, reason)
+        if opening.start_s >= job.film_s:
+            findings.warn(
+                (*path, "start_s"), f"starts at {opening.start_s:g} s, after the film's end at {job.film_s:g} s"
+            )
 
 
 def _check_fluid(soft: SoftParameters, spacing: float, findings: Findings) -> None:

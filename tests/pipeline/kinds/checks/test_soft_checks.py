@@ -85,3 +85,26 @@ def test_cells_are_told_that_fluid_slips_through_or_that_are_far_finer_than_it(t
     code, output = told(tmp_path, pool, "--set", "soft.jelly.cell_size=0.015")
     assert code == 0
     assert "each of these feels some 318 of soft matter where they touch; use 0.04 m" in output
+
+
+EMITTER = """\
+[[soft.emitter]]
+shape = { type = "disc", radius = 0.05 }
+position = [0.0, 0.0, 0.6]
+direction = [0.0, 0.0, -1.0]
+flow_rate = 0.004
+total_volume = 0.002
+"""
+
+
+def test_what_emitters_pour_is_counted_and_their_openings_are_looked_at(tmp_path):
+    code, output = told(tmp_path, JOB + EMITTER)
+    assert code == 0
+    assert "about 10,000 particles of soft matter" in output
+    for option, expected in (
+        ("position=[0.0,0.0,1.2]", "soft[0].emitter[0]: 78 of the 78 places of its opening are outside the domain"),
+        ("shape.radius=0.003", "soft[0].emitter[0].shape: is too narrow for particles 0.01 m apart; enlarge it or"),
+        ("start_s=2.0", "soft[0].emitter[0].start_s: starts at 2 s, after the film's end at 0.0333333 s"),
+    ):
+        _, output = told(tmp_path, JOB + EMITTER, "--set", f"soft.jelly.emitter.0.{option}")
+        assert expected in output
