@@ -151,13 +151,13 @@ def _build_fluids(
     movers = [body for body in scene.rigid if body.kind != "static"]
     shapes = SharedShapes()
     solids = [*(body.solid for body in static), *(build_solid(body, shapes) for body in movers)]
+    solids += [build_solid(block, shapes) for each in scene.soft for block in each.block]
     fluids = with_emitters_on(scene.fluid, scene.rigid)
     followed = {body.name: body for body in movers}
     _check_openings(fluids, scene, solids, followed, spacing, volume)
     for each in scene.soft:
         if coarse := coarse_for_fluid(each, spacing):
             raise ValueError(f'soft "{each.name}": cell_size {coarse}')
-    solids += [build_solid(block, shapes) for each in scene.soft for block in each.block]
     filling = fill_fluids(fluids, scene.domain, solids, None if cloth is None else (cloth.start, cloth.normals))
     speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]
     speeds += [] if soft is None else [expected_soft_speed(soft, scene.domain)]

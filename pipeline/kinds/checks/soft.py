@@ -59,7 +59,7 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
             filled.append(solid)
             total += particles
         total += sum(round(each.emitted_volume(math.inf) / soft.spacing**3) for each in soft.emitter)
-        _check_emitters(job, index, walls, findings)
+        _check_emitters(job, index, solids, findings)
     each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0)
     if refusal := budget.refusal(total, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
@@ -82,9 +82,10 @@ def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings)
         )
 
 
-def _check_emitters(job: Job, index: int, walls: list[PlacedSolid], findings: Findings) -> None:
+def _check_emitters(job: Job, index: int, solids: Solids, findings: Findings) -> None:
     """Refuse openings that are too narrow, outside the domain, or in bodies, and warn of those that come too late."""
     soft = job.soft[index]
+    obstacles = [solid for path, solid in solids.items() if path[0] in ("rigid", "soft")]
     for number, emitter in enumerate(soft.emitter):
         path: KeyPath = ("soft", index, "emitter", number)
         if not mesh_exists(emitter.shape, path, findings):
@@ -94,7 +95,7 @@ def _check_emitters(job: Job, index: int, walls: list[PlacedSolid], findings: Fi
         except ValueError as error:
             findings.error((*path, "shape"), str(error).replace("particle_radius", "cell_size"))
             continue
-        if reason := obstruction(opening, soft.spacing, job.domain, walls):
+        if reason := obstruction(opening, soft.spacing, job.domain, obstacles):
             findings.error(path, reason)
         if opening.start_s >= job.film_s:
             findings.warn(

@@ -103,6 +103,7 @@ def test_what_emitters_pour_is_counted_and_their_openings_are_looked_at(tmp_path
     assert "about 10,000 particles of soft matter" in output
     for option, expected in (
         ("position=[0.0,0.0,1.2]", "soft[0].emitter[0]: 78 of the 78 places of its opening are outside the domain"),
+        ("position=[0.0,0.0,0.1]", "78 of the 78 places of its opening are in a solid body; move it out"),
         ("shape.radius=0.003", "soft[0].emitter[0].shape: is too narrow for particles 0.01 m apart; enlarge it or"),
         ("start_s=2.0", "soft[0].emitter[0].start_s: starts at 2 s, after the film's end at 0.0333333 s"),
     ):
