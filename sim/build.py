@@ -11,7 +11,7 @@ from sim.cloth.solver import SOLVER_NAME as CLOTH_NAME
 from sim.cloth.solver import ClothSolver
 from sim.core.solver import Coupling, Solver
 from sim.core.world import World
-from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
+from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed, expected_soft_speed
 from sim.coupling.cloth_fluid import ClothFluidCoupling, ClothSamples
 from sim.coupling.cloth_joints import ClothJointsCoupling, passing_of, points_of_joints
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
@@ -23,6 +23,8 @@ from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
+from sim.coupling.soft_emitters import poured_by
+from sim.coupling.soft_fluid import SoftFluidCoupling, samples_of_soft
 from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
 from sim.embers.solver import EmberSolver
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
@@ -43,6 +45,7 @@ from sim.rigid.states import StaticBody
 from sim.shapes.placement import SharedShapes, build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.smoke.solver import SmokeSolver
+from sim.soft.parameters import coarse_for_fluid
 from sim.soft.solver import SOLVER_NAME as SOFT_NAME
 from sim.soft.solver import SoftSolver
 
@@ -85,12 +88,13 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     sewn = any(cloth.name in joint.between for joint in scene.joint for cloth in scene.cloth)
     nodes, points = points_of_joints(scene.joint, cloths[0], frames_per_second) if sewn else (None, None)
     rigid = _build_rigid(scene, points, forces)
+    softs = [_build_soft(scene, static, forces)] if scene.soft else []
     samples = None
     if cloths and scene.fluid:
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
-    fluids = [_build_fluids(scene, static, rigid, samples, forces)] if scene.fluid else []
+    around = static, rigid, samples, next(iter(softs), None)
+    fluids = [_build_fluids(scene, *around, forces)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, static, forces, 1.0 / frames_per_second) for smoke in scene.smoke]
-    softs = [_build_soft(scene, static, forces)] if scene.soft else []
     coupled: list[Solver] = [*fluids, *cloths, *softs, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
@@ -103,15 +107,16 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
             couplings.append(ClothJointsCoupling(cloth, rigid, nodes, passing))
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     for soft in softs:
-        soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static)
+        couplings += [SoftFluidCoupling(fluid, soft) for fluid in fluids]
+        soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static, mass=soft.mass + _most_mass(fluids))
         if rigid is not None and soft.contacts is not None:
             couplings.append(SoftRigidCoupling(soft, rigid, soft.contacts))
-    by_name = {smoke.name: smoke for smoke in smokes}
-    for parameters in scene.embers:
-        air = AirOfSmoke(by_name[parameters.smoke], scene.domain)
-        given = {"gravity": scene.gravity, "frames_per_second": frames_per_second}
-        coupled.append(EmberSolver(parameters, air=air, **given))
-    couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
+    airs = {smoke.name: AirOfSmoke(smoke, scene.domain) for smoke in smokes}
+    coupled += [
+        EmberSolver(each, air=airs[each.smoke], gravity=scene.gravity, frames_per_second=frames_per_second)
+        for each in scene.embers
+    ]
+    couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, softs=softs, rigid=rigid)
     standing = {body.name: body.snapshot() for body in static}
     return World(
         [*coupled, *solvers],
@@ -142,6 +147,7 @@ def _build_fluids(
     static: Sequence[StaticBody],
     rigid: RigidSolver | None,
     cloth: ClothSamples | None,
+    soft: SoftSolver | None,
     forces: ForceField | None,
 ) -> SPHFluid:
     """One solver for all fluids, as they share the tank; of what moves it has the samples."""
@@ -154,11 +160,16 @@ def _build_fluids(
     movers = [body for body in scene.rigid if body.kind != "static"]
     shapes = SharedShapes()
     solids = [*(body.solid for body in static), *(build_solid(body, shapes) for body in movers)]
+    solids += [build_solid(block, shapes) for each in scene.soft for block in each.block]
     fluids = with_emitters_on(scene.fluid, scene.rigid)
     followed = {body.name: body for body in movers}
     _check_openings(fluids, scene, solids, followed, spacing, volume)
+    for each in scene.soft:
+        if coarse := coarse_for_fluid(each, spacing):
+            raise ValueError(f'soft "{each.name}": cell_size {coarse}')
     filling = fill_fluids(fluids, scene.domain, solids, None if cloth is None else (cloth.start, cloth.normals))
     speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]
+    speeds += [] if soft is None else [expected_soft_speed(soft, scene.domain)]
     speeds += [] if cloth is None else [expected_cloth_speed(scene.cloth, cloth.start, scene.domain, scene.gravity)]
     samples = [
         sink_samples(
@@ -183,7 +194,7 @@ def _build_fluids(
         dye=filling.dye,
         boundary=BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples),
         moving=BoundarySamples.of_bodies() if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
-        sheets=None if cloth is None else cloth.sheets,
+        sheets=samples_of_soft(soft) if soft is not None else None if cloth is None else cloth.sheets,
         body_count=len(movers),
         body_speed=max(speeds, default=0.0),
         followed=followed,
@@ -192,6 +203,11 @@ def _build_fluids(
         forces=forces,
     )
     return SOLVERS[scene.fluid[0].solver](start)
+
+
+def _most_mass(fluids: Sequence[SPHFluid]) -> float:
+    """Of all the fluid that there can ever be [kg]."""
+    return sum(f.particles.capacity * f.particle_volume * float(f.phases.rest_densities.max()) for f in fluids)
 
 
 def _check_openings(
@@ -256,6 +272,7 @@ def _build_soft(scene: SceneParameters, static: Sequence[StaticBody], forces: Fo
         domain=scene.domain,
         gravity=scene.gravity,
         solids=[*(body.solid for body in static), *movers],
+        poured=poured_by(scene.soft),
         forces=forces,
     )
 
@@ -273,16 +290,16 @@ def _build_smoke(
         domain=scene.domain,
         gravity=scene.gravity,
         solids=[body.solid for body in static],
-        moving=_meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
+        moving=_meets_particles(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
         forces=forces,
         frame_s=frame_s,
     )
 
 
-def _meets_fluid(smoke: SmokeParameters, scene: SceneParameters) -> bool:
-    """Whether fluid, which stays in the domain, could come into the smoke's box."""
+def _meets_particles(smoke: SmokeParameters, scene: SceneParameters) -> bool:
+    """Whether fluid or soft matter, which stay in the domain, could come into the smoke's box."""
     domain = scene.domain
-    return bool(scene.fluid) and boxes_overlap(smoke.corners(domain), (domain.min, domain.max))
+    return bool(scene.fluid or scene.soft) and boxes_overlap(smoke.corners(domain), (domain.min, domain.max))
 
 
 def _couple_smokes(
@@ -291,6 +308,7 @@ def _couple_smokes(
     *,
     fluids: Sequence[SPHFluid],
     cloths: Sequence[ClothSolver],
+    softs: Sequence[SoftSolver],
     rigid: RigidSolver | None,
 ) -> list[Coupling]:
     """Each smoke with what is in its way, which is put there, and with what hangs in it."""
@@ -301,8 +319,8 @@ def _couple_smokes(
         for body, reason in too_thin_bodies(smoke.parameters, moving, solids, scene.domain):
             raise ValueError(f'"{moving[body].name}" {reason}')
         in_the_way: list[Coupling] = []
-        if _meets_fluid(smoke.parameters, scene):
-            in_the_way += [SmokeFluidCoupling(fluid, smoke, domain=scene.domain) for fluid in fluids]
+        if _meets_particles(smoke.parameters, scene):
+            in_the_way += [SmokeFluidCoupling(each, smoke, domain=scene.domain) for each in (*fluids, *softs)]
         in_the_way += [] if rigid is None else [SmokeRigidCoupling(rigid, smoke)]
         for coupling in in_the_way:
             coupling.exchange(0.0)

@@ -38,7 +38,8 @@ class SceneParameters(Parameters):
         default=(), description="Cloths; they collide with each other, and share the keys that say how they step."
     )
     soft: tuple[SoftParameters, ...] = Field(
-        default=(), description="Sand, snow, jelly and clay; they share a grid, and meet walls and rigid bodies."
+        default=(),
+        description="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies, fluids and smoke.",
     )
     embers: tuple[EmberParameters, ...] = Field(default=(), description="Embers that the air of a smoke carries.")
     force: Annotated[tuple[Force, ...], Field(max_length=MOST_FORCES)] = Field(
@@ -84,12 +85,12 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_soft_matter_among_bodies(self) -> Self:
-        """Soft matter has couplings with rigid bodies alone, and would pass through the others."""
-        for name, there in (("fluid", self.fluid), ("cloth", self.cloth), ("smoke", self.smoke)):
-            if self.soft and there:
-                raise KeyRefusedError(
-                    ("soft", 0), f"meets walls and rigid bodies, and would pass through {name}; remove one of both"
-                )
+        """Soft matter has no coupling with cloth, and would pass through it."""
+        if self.soft and self.cloth:
+            raise KeyRefusedError(
+                ("soft", 0),
+                "meets walls, rigid bodies, fluids and smoke, and would pass through cloth; remove one of both",
+            )
         return self
 
     @model_validator(mode="after")
@@ -117,7 +118,8 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_whole_boxes_beside_others(self) -> Self:
-        other = "fluid" if self.fluid else "cloth" if self.cloth else None
+        others = {"fluid": self.fluid, "cloth": self.cloth, "soft matter": self.soft}
+        other = next((name for name, there in others.items() if there), None)
         for number, smoke in enumerate(self.smoke):
             if smoke.grid != "box" and other is not None:
                 raise KeyRefusedError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,8 +56,14 @@ def is_grainy(soft: SoftParameters) -> bool:
 
 
 def count_particles(soft: SoftParameters) -> float:
-    """About the particles of a body: what its blocks hold. Raises as `measures_of`."""
-    return float(sum(measures_of(block).volume for block in soft.block) / soft.spacing**3)
+    """About the particles of a body: what its blocks hold and emitters let in. Raises as `measures_of`."""
+    return _volume(soft) / soft.spacing**3
+
+
+def _volume(soft: SoftParameters) -> float:
+    """Of all that there ever is of a body [m³]. Raises as `measures_of`."""
+    poured = sum(emitter.emitted_volume(math.inf) for emitter in soft.emitter)
+    return float(sum(measures_of(block).volume for block in soft.block) + poured)
 
 
 def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
@@ -123,7 +130,7 @@ MATTER = Product(
 SOFT = Kind(
     name="soft",
     parameters=SoftParameters,
-    about="Sand, snow, jelly and clay; they share a grid, and meet walls and rigid bodies.",
+    about="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies, fluids and smoke.",
     size="about {:,} particles of soft matter",
     elements=lambda _job, soft: count_particles(soft),
     snapshot_bytes=(150.0, 24.0, 140.0),
@@ -133,7 +140,7 @@ SOFT = Kind(
     drawing=0.6,
     wears="rigid",
     material=lambda soft: {BODY: LOOKS[soft.material]},
-    look_size=lambda _job, soft: sum(measures_of(block).volume for block in soft.block) ** (1.0 / 3.0),
+    look_size=lambda _job, soft: _volume(soft) ** (1.0 / 3.0),
     boxes=lambda _job, soft: map(box_of, soft.block),
     placements=_placements,
     check=_check,

@@ -1,4 +1,4 @@
-"""Largest speeds of bodies and cloths, as far as their start and their paths tell."""
+"""Largest speeds of bodies, cloths and soft matter, as far as their start and their paths tell."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.start import path_of_pin
 from sim.core.domain import DomainParameters
+from sim.core.host_access import copied
 from sim.core.motion import rotation
 from sim.core.parameters import Vector3
 from sim.fluid.expected_speed import square_of_fall_speed
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
 from sim.shapes.body_geometry import BodyGeometry
+from sim.soft.solver import SoftSolver
 
 
 def expected_body_speed(
@@ -56,3 +58,12 @@ def expected_cloth_speed(
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
     pins = [path_of_pin(pin).largest_speed(extent) for cloth in parameters for pin in cloth.pin if pin.keyframe]
     return max(math.sqrt(fastest**2 + square_of_fall_speed(positions, domain, gravity)), *pins, 0.0)
+
+
+def expected_soft_speed(soft: SoftSolver, domain: DomainParameters) -> float:
+    """Largest speed [m/s] to expect of soft matter: that of its start or its emitters, with a fall from the highest."""
+    blocks = [math.hypot(*block.velocity) for body in soft.parameters for block in body.block]
+    fastest = max([*blocks, soft.poured.largest_speed])
+    places = copied(soft.particles.position)[copied(soft.particles.body) >= 0]
+    points = np.concatenate([places, soft.poured.position])
+    return math.sqrt(fastest**2 + square_of_fall_speed(points, domain, soft.gravity))

@@ -1,4 +1,4 @@
-"""Water as an obstacle for smoke and air."""
+"""Water and soft matter as obstacles for smoke and air."""
 
 import math
 from typing import TYPE_CHECKING, NamedTuple
@@ -7,13 +7,12 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, LongIntegers
+from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import bundle
 from sim.core.domain import DomainParameters
 from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.solver import Coupling
-from sim.fluid.particles import Particles
 from sim.smoke.arrays import new_floats
 from sim.smoke.cut_cells import ROUNDING
 from sim.smoke.grid import SmokeGrid, cell_corners
@@ -23,6 +22,7 @@ from sim.smoke.obstacles import Marks, mark
 if TYPE_CHECKING:
     from sim.fluid.fluid import SPHFluid
     from sim.smoke.solver import SmokeSolver
+    from sim.soft.solver import SoftSolver
 
 REACH_IN_SPACINGS = (
     2.0  # least half-width of a particle's weight: a lone one fills an eighth of its place, without holes
@@ -58,7 +58,7 @@ class Reach(NamedTuple):
 
 
 class SmokeFluidCoupling(Coupling):
-    """Air cannot enter water, and moves with its surface.
+    """Air cannot enter water or soft matter, which is meant by water here, and moves with its surface.
 
     A coupled step of the smoke: the fluid takes its own, shorter steps; then the cells that hold water are marked as
     obstacles with the velocity of the water in them, as wholes, and the smoke steps around them. One way: water does
@@ -82,7 +82,7 @@ class SmokeFluidCoupling(Coupling):
 
     is_loose = True
 
-    def __init__(self, fluid: "SPHFluid", smoke: "SmokeSolver", *, domain: DomainParameters) -> None:
+    def __init__(self, fluid: "SPHFluid | SoftSolver", smoke: "SmokeSolver", *, domain: DomainParameters) -> None:
         """Couple the two; the first water is marked, and is there once the smoke has moved its obstacles."""
         self.bodies = (fluid.name, smoke.name)
         self._fluid, self._smoke = fluid, smoke
@@ -100,44 +100,48 @@ class SmokeFluidCoupling(Coupling):
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no particle gets farther than a cell in the box, as far as is foreseen."""
-        particles = self._fluid.particles.arrays
-        _find_shortest_time(self._reach, self._gravity, particles, self._shortest_time)
+        particles = self._fluid.particles
+        moving = particles.position, particles.velocity, particles.count
+        _find_shortest_time(self._reach, self._gravity, *moving, self._shortest_time)
         time_s = float(copied(self._shortest_time)[0])
         return time_s if time_s < NEVER else math.inf
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that hold water now, after the steps of the fluid."""
         box, marks = self._smoke.obstacles.box, self._smoke.obstacles.marks
-        _splat(self._reach, box, self._sums, self._fluid.particles.arrays)
+        particles = self._fluid.particles
+        _splat(self._reach, box, self._sums, particles.position, particles.velocity, particles.count)
         _mark_water(box, self._sums, marks)
 
 
 @kernel
-def _find_shortest_time(reach: Reach, gravity: ti.f32, particles: Particles, shortest: Floats):
+def _find_shortest_time(
+    reach: Reach, gravity: ti.f32, position: Vectors, velocity: Vectors, count: ti.i32, shortest: Floats
+):
     """Least time in which a particle comes to the box and a cell into it, v t + g t² = d (`time_of_travel`)."""
     margin = reach.in_cells * reach.cell_size
     shortest[0] = NEVER
-    for n in range(particles.count):
-        x_n = particles.position[n]
+    for n in range(count):
+        x_n = position[n]
         outside = ti.max(reach.low - margin - x_n, x_n - (reach.high + margin), 0.0)
         distance = outside.norm() + reach.cell_size
-        speed = particles.velocity[n].norm()
+        speed = velocity[n].norm()
         root = speed + ti.sqrt(speed * speed + 4.0 * gravity * distance)
         if root > 0.0:
             ti.atomic_min(shortest[0], 2.0 * distance / root)
 
 
 @kernel
-def _splat(reach: Reach, box: Grid, sums: Sums, particles: Particles):
+def _splat(reach: Reach, box: Grid, sums: Sums, position: Vectors, velocity: Vectors, count: ti.i32):
     """Add every particle to the cells whose centres it reaches, in sums that begin at zero."""
     for at in range(sums.fraction.shape[0]):
         sums.fraction[at] = 0
         for momentum in ti.static((sums.momentum_x, sums.momentum_y, sums.momentum_z)):
             momentum[at] = ti.cast(0, ti.i64)
-    for n in range(particles.count):
+    for n in range(count):
         cells, width = cell_counts(box), reach.in_cells
         # In cells, such that the centre of cell i, counted from 1, is at i.
-        x_n = (particles.position[n] - reach.low) / reach.cell_size + 0.5
+        x_n = (position[n] - reach.low) / reach.cell_size + 0.5
         if (x_n > 1.0 - width).all() and (x_n < ti.cast(cells, ti.f32) + width).all():
             low = ti.max(ti.cast(ti.floor(x_n - width), ti.i32) + 1, 1)
             high = ti.min(ti.cast(ti.ceil(x_n + width), ti.i32) - 1, cells)
@@ -150,7 +154,7 @@ def _splat(reach: Reach, box: Grid, sums: Sums, particles: Particles):
                         at = row_start(box, i, j) + k
                         ti.atomic_add(sums.fraction[at], ti.round(weight / FRACTION_QUANTUM, ti.i32))
                         for axis, momentum in ti.static(enumerate((sums.momentum_x, sums.momentum_y, sums.momentum_z))):
-                            share = weight * particles.velocity[n][axis]
+                            share = weight * velocity[n][axis]
                             ti.atomic_add(momentum[at], ti.round(share / MOMENTUM_QUANTUM, ti.i64))
 
 

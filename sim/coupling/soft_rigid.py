@@ -20,9 +20,17 @@ if TYPE_CHECKING:
 
 
 def contacts_of_soft(
-    soft: SoftSolver, bodies: Sequence[RigidBodyParameters], rigid: RigidSolver | None, static: Sequence[StaticBody]
+    soft: SoftSolver,
+    bodies: Sequence[RigidBodyParameters],
+    rigid: RigidSolver | None,
+    static: Sequence[StaticBody],
+    *,
+    mass: float,
 ) -> BodyContacts | None:
-    """The bodies of a scene as its soft matter meets them, those that move first; None if there are none."""
+    """The bodies of a scene as its soft matter meets them, those that move first; None if there are none.
+
+    `mass` is of soft matter and all that may move along with it [kg].
+    """
     moving = [body for body in bodies if body.kind != "static"]
     standing = [body for body in bodies if body.kind == "static"]
     if not bodies:
@@ -31,7 +39,7 @@ def contacts_of_soft(
     geometries = [*(() if rigid is None else rigid.solids), *still]
     own = soft.parameters[0].friction
     friction = [math.sqrt(own * body.friction) for body in (*moving, *standing)]
-    contacts = BodyContacts(geometries, len(moving), friction, soft.mass)
+    contacts = BodyContacts(geometries, len(moving), friction, mass)
     rotation = np.array([body.solid.rotation for body in static]).reshape(-1, 3, 3)
     position = np.array([body.solid.position for body in static]).reshape(-1, 3)
     centre = np.array([geometry.centre_of_mass for geometry in still]).reshape(-1, 3)

@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from sim.core.motion import rotation
 from sim.core.motion.paths import KeyframePath, Motion, path_through
 from sim.fluid.opening_layers import best_layer
-from sim.fluid.parameters import RectangleOpening
+from sim.shapes.openings import RectangleOpening
 
 if TYPE_CHECKING:
-    from sim.fluid.inflow import Inflow
     from sim.fluid.parameters import EmitterParameters, FluidParameters
+    from sim.shapes.inflow import Inflow
     from sim.shapes.parameters import Placement
 
 MOUTH_IN_SPACINGS = 0.75  # how far from a place in an opening samples of a wall are in its mouth

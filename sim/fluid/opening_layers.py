@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.fluid.parameters import DiscOpening, OpeningShape, RectangleOpening
+from sim.shapes.openings import DiscOpening, OpeningShape, RectangleOpening
 from sim.shapes.section import Section, section_of
 
 NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35  # of particles and of layers: nearer, they would burst out

@@ -63,7 +63,7 @@ class BodyContacts:
         geometries: of all bodies, one at least.
         moving: how many of them, the first ones, may move.
         friction: of soft matter against each body [-].
-        mass: of all soft matter [kg].
+        mass: of all soft matter, and of what may move along with it [kg].
     """
 
     def __init__(self, geometries: Sequence[BodyGeometry], moving: int, friction: Sequence[float], mass: float) -> None:

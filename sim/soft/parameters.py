@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
+from sim.shapes.openings import InflowParameters
 from sim.shapes.parameters import Placement
 from sim.soft.materials import LAW_KEYS, MATERIALS, MaterialRow
 
@@ -25,8 +26,18 @@ class SoftBlockParameters(Placement):
     velocity: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Initial velocity [m/s].")
 
 
+class SoftEmitterParameters(InflowParameters):
+    """An opening from which soft matter is poured, without stress; end_s or total_volume says how much in all."""
+
+    @model_validator(mode="after")
+    def _ends(self) -> Self:
+        if self.end_s is None and self.total_volume is None:
+            raise ValueError("has neither end_s nor total_volume; add one of them")
+        return self
+
+
 class SoftParameters(Parameters):
-    """A body of soft matter: what it is made of, how finely it is computed, and the volumes that it fills."""
+    """A body of soft matter: what it is made of, how finely it is computed, and where it is and comes in."""
 
     name: BodyName = Field(description="Name of the body, unique in the job.")
     material: Literal["sand", "wet_sand", "snow", "jelly", "rubber", "clay", "dough", "cream"] = Field(
@@ -34,7 +45,8 @@ class SoftParameters(Parameters):
         + "; ".join(f"{name}: {row.about}" for name, row in MATERIALS.items())
         + "."
     )
-    block: tuple[SoftBlockParameters, ...] = Field(min_length=1, description="Volumes filled at the start.")
+    block: tuple[SoftBlockParameters, ...] = Field(default=(), description="Volumes filled at the start.")
+    emitter: tuple[SoftEmitterParameters, ...] = Field(default=(), description="Openings from which it is poured.")
     cell_size: Positive = Field(
         default=0.02, description="Edge of the grid's cells [m], with eight particles each; one for all soft bodies."
     )
@@ -72,6 +84,12 @@ class SoftParameters(Parameters):
         "the root of the product.",
     )
     cfl: Positive = Field(default=1.0, le=1.5, description="Factor on the largest stable step [-].")
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> Self:
+        if not self.block and not self.emitter:
+            raise ValueError("has neither a block nor an emitter; add [[soft.block]] or [[soft.emitter]]")
+        return self
 
     @model_validator(mode="after")
     def _has_keys_of_its_law(self) -> Self:
@@ -113,6 +131,21 @@ class SoftParameters(Parameters):
     def longest_step(self) -> float:
         """Largest stable step of the material as it starts [s]."""
         return self.cfl * WAVE_NUMBER * self.cell_size / self.wave_speed
+
+
+COARSEST = 1.25
+"""Distance of particles of soft matter over that of a fluid's beyond which fluid gets in between."""
+
+
+def coarse_for_fluid(soft: SoftParameters, spacing: float) -> str | None:
+    """Why a fluid of particles at a spacing [m] would get into a soft body, in words that follow its cell_size."""
+    if soft.spacing <= COARSEST * spacing:
+        return None
+    most = PARTICLES_PER_CELL_EDGE * COARSEST * spacing
+    return (
+        f"of {soft.cell_size:g} m would let fluid through, whose particles are {spacing:g} m apart; "
+        f"use {most:.3g} m or less"
+    )
 
 
 SHARED_KEYS = ("cell_size", "friction", "cfl")

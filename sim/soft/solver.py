@@ -26,10 +26,12 @@ from sim.soft.contact import BodyContacts, stop_at_walls
 from sim.soft.laws import Laws
 from sim.soft.materials import Law
 from sim.soft.parameters import SoftParameters, shared_conflicts
+from sim.soft.pouring import Poured, Pouring, has_come, waiting_rows
 from sim.soft.transfers import (
     COUNTS,
     MAXIMA,
     SHARES,
+    Load,
     Nodes,
     Particles,
     Shares,
@@ -66,7 +68,12 @@ class SoftSolver:
         gravity: [m/s²]; may be changed between frames.
         contacts: rigid bodies that soft matter meets; None where there are none.
         particles: for kernels.
-        mass: of all particles at the start [kg].
+        load: what touches the particles in the next step; none before `let_touch`.
+        masses: of a particle of each body [kg], (bodies,), on the device.
+        spacing, volume: of particles at rest [m, m³].
+        poured: what emitters let in.
+        owner: the body of each particle, whether it is there, has left or is to come, (n,), on the host.
+        mass: of all particles that there ever are [kg].
 
     Raises:
         ShapeError: a shape cannot be built.
@@ -80,6 +87,7 @@ class SoftSolver:
         domain: DomainParameters,
         gravity: Vector3,
         solids: Sequence[Solid] = (),
+        poured: Poured | None = None,
         forces: ForceField | None = None,
     ) -> None:
         self.name, self.parameters, self.gravity = SOLVER_NAME, tuple(parameters), gravity
@@ -87,15 +95,22 @@ class SoftSolver:
             number, key, message = conflicts[0]
             raise ValueError(f'soft "{self.parameters[number].name}": {key} {message}')
         position, velocity, body, volume = _filled(self.parameters, domain, solids)
+        self.poured = poured or Poured.together([])
+        self.owner = np.concatenate([body, self.poured.body])
+        self._pouring = Pouring(self.poured, len(position)) if len(self.poured.body) else None
+        rows = zip((position, velocity, body), waiting_rows(self.poured), strict=True)
+        position, velocity, body = (np.concatenate(each) for each in rows)
         n = len(position)
         density = np.array([each.value("density") for each in self.parameters])
         particle_mass = density * volume
-        self.mass = float(particle_mass[body].sum())
+        self.mass = float(particle_mass[self.owner].sum())
         matrices = [ti.Matrix.ndarray(3, 3, ti.f32, n) for _ in range(3)]
         self.particles = Particles(
             on_device(position), on_device(velocity), *matrices, ti.ndarray(ti.f32, n), on_device(body), n
         )
-        self._masses, self._volume = on_device(particle_mass), volume
+        self.spacing = self.parameters[0].spacing
+        self.masses, self.volume = on_device(particle_mass), volume
+        self._load_particles(0)
         self._laws = laws_of(self.parameters)
         self._grid = BlockGrid(domain, self.parameters[0].cell_size, n)
         self._make_nodes()
@@ -103,8 +118,16 @@ class SoftSolver:
         self._forces = (forces or ForceField(())).on([(each.name,) for each in self.parameters])
         self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
         self.contacts: BodyContacts | None = None
-        self._started = n
+        self._time_s = 0.0
         self._measure()
+
+    def let_touch(self) -> None:
+        """Make room for what touches particles, which whoever couples them gives before each step."""
+        self._load_particles(self.particles.count)
+
+    def _load_particles(self, count: int) -> None:
+        arrays = ti.ndarray(ti.f32, max(count, 1)), ti.Vector.ndarray(3, ti.f32, max(count, 1))
+        self.load = Load(*arrays, there=count > 0)
 
     def _make_nodes(self) -> None:
         room = self._grid.blocks.room * NODES
@@ -129,17 +152,21 @@ class SoftSolver:
             for each in self.parameters
         )
         way = shared.cfl * MOTION_NUMBER * shared.cell_size
-        return min(by_waves, way / max(self._speed, math.sqrt(way * fall), TINY_SPEED))
+        speed = max(self._speed, 0.0 if self._pouring is None else self._pouring.largest_speed)
+        return min(by_waves, way / max(speed, math.sqrt(way * fall), TINY_SPEED))
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         particles, grid = self.particles, self._grid
+        if self._pouring is not None:
+            self._pouring.let_in(particles, self._time_s)
+        self._time_s += dt
         if self._forces.accelerates:
             push_particles(particles, self._forces.now, dt)
         if grid.sort(particles.position, particles.body):
             self._make_nodes()
         blocks, stored = grid.blocks, grid.count
-        given = self._masses, self._volume, self._shares, self._nodes, ti.math.vec3(self.gravity)
+        given = self.masses, self.volume, self.load, self._shares, self._nodes, ti.math.vec3(self.gravity)
         particles_to_grid(blocks, stored, particles, *given, dt)
         if self.contacts is not None:
             self.contacts.resolve(blocks, stored, self._nodes, dt)
@@ -148,7 +175,8 @@ class SoftSolver:
         self._measure()
 
     def begin_frame(self, time_s: float) -> None:
-        """Nothing is counted by frames."""
+        """Emitters go by the time of the frame."""
+        self._time_s = time_s
 
     # --- what others ask --------------------------------------------------------------------------------------------
 
@@ -198,20 +226,22 @@ class SoftSolver:
             if arrays[name].shape != expected:
                 raise ValueError(f"{name} of the checkpoint has shape {arrays[name].shape}, not {expected}")
             array.from_numpy(np.ascontiguousarray(arrays[name]))
+        if self._pouring is not None:
+            self._pouring.here = int(has_come(arrays["body"])[-self._pouring.count :].sum())
         self._measure()
 
     def diagnostics(self) -> Diagnostics:
         """Momentum, energies and sizes."""
         body = copied(self.particles.body)
         inside = body >= 0
-        mass = copied(self._masses)[body[inside]].astype(np.float64)
+        mass = copied(self.masses)[body[inside]].astype(np.float64)
         position, velocity = (
             copied(array)[inside].astype(np.float64) for array in (self.particles.position, self.particles.velocity)
         )
         momentum = mass @ velocity
         return {
             "particle_count": float(inside.sum()),
-            "particles_left": float(self._started - inside.sum()),
+            "particles_left": float((body == -1).sum()),
             "mass": float(mass.sum()),
             "max_speed": self._speed,
             "kinetic_energy": float(0.5 * mass @ (velocity**2).sum(axis=1)),
@@ -246,7 +276,7 @@ def _filled(
     """Positions [m], velocities [m/s] and bodies of the particles that fill all blocks, and the volume of each [m³]."""
     spacing = parameters[0].spacing
     positions, velocities = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
-    bodies: list[NDArray[np.int32]] = []
+    bodies = [np.empty(0, np.int32)]
     filled: list[Solid] = []
     for index, soft in enumerate(parameters):
         for number, block in enumerate(soft.block):

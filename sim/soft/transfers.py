@@ -37,11 +37,12 @@ SHARES = SUPPORT**3
 WARP = 32  # threads of a GPU that read together
 APIC = 4.0  # over h², the inverse of the splines' second moment
 MAXIMA, COUNTS = 2, 1  # of `measure`
+AWAY = 1.0e9  # coordinate of what has left, where it is in no one's way [m]
 
 
 @bundle
 class Particles(NamedTuple):
-    """Particles, (n,) each; body -1 has left."""
+    """Particles, (n,) each; body -1 has left, and those below wait; they are far away then."""
 
     position: Vectors  # [m]
     velocity: Vectors  # [m/s]
@@ -51,6 +52,15 @@ class Particles(NamedTuple):
     history: Floats  # of the law [-]
     body: Integers
     count: ti.i32
+
+
+@bundle
+class Load(NamedTuple):
+    """What touches particles and moves along with them in a step, (n,) each."""
+
+    mass: Floats  # [kg]
+    momentum: Vectors  # with the impulses on the particle, before gravity [kg m/s]
+    there: ti.template()  # whether anything can touch them; no particle has a load otherwise
 
 
 @bundle
@@ -100,9 +110,10 @@ def give(
     blocks: Blocks,
     particles: Particles,
     masses: Floats,
+    load: Load,
     shares: Shares,
 ):
-    """What the particles of a cell, with this lowest node, give to one of their nodes."""
+    """What the particles of a cell, with this lowest node, give to one of their nodes, their loads included."""
     at = ti.cast(corner + Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2), ti.f32)
     mass = 0.0
     momentum = ti.math.vec3(0.0)
@@ -111,8 +122,12 @@ def give(
         away = at - place_of(particles.position[p], blocks)
         weight = weight_at(away)
         own = masses[particles.body[p]]
+        carried = own * particles.velocity[p] + particles.affine[p] @ away
+        if ti.static(load.there):
+            own += load.mass[p]
+            carried += load.momentum[p]
         mass += weight * own
-        momentum += weight * (own * particles.velocity[p] + particles.affine[p] @ away)
+        momentum += weight * carried
     place = cell * SHARES + lane
     shares.mass[place] = mass
     shares.momentum[place] = momentum
@@ -125,6 +140,7 @@ def particles_to_grid(
     particles: Particles,
     masses: Floats,
     volume: ti.f32,
+    load: Load,
     shares: Shares,
     nodes: Nodes,
     gravity: ti.math.vec3,
@@ -132,25 +148,28 @@ def particles_to_grid(
 ):
     """Mass and velocity of the nodes, gravity included; C becomes its momentum with the impulse of the stress.
 
-    Particles have masses by body [kg], and all of them one volume at rest [m³].
+    Particles have masses by body [kg], and all of them one volume at rest [m³]. What touches a particle has its C.
     """
     for p in range(particles.count):
         b = particles.body[p]
         if b >= 0:
             pull = dt * volume * APIC / blocks.edge
-            particles.affine[p] = blocks.edge * masses[b] * particles.affine[p] - pull * particles.stress[p]
+            mass = masses[b]
+            if ti.static(load.there):
+                mass += load.mass[p]
+            particles.affine[p] = blocks.edge * mass * particles.affine[p] - pull * particles.stress[p]
     if ti.static(runs_on_gpu()):
         ti.loop_config(block_dim=128)
         for i in range(stored * (NODES * WARP)):
             cell = i // WARP
             if i % WARP < SHARES and blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
-                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, masses, shares)
+                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, masses, load, shares)
     else:
         for cell in range(stored * NODES):
             if blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
                 corner = node_of(cell, blocks)
                 for lane in range(SHARES):
-                    give(cell, corner, lane, blocks, particles, masses, shares)
+                    give(cell, corner, lane, blocks, particles, masses, load, shares)
     for n in range(stored * NODES):
         inside = Triple(n % EDGE, n // EDGE % EDGE, n % NODES // (EDGE * EDGE))
         mass = 0.0
@@ -207,6 +226,7 @@ def grid_to_particles(
         particles.position[p] = moved
         if (moved < box.keep_low).any() or (moved > box.keep_high).any():
             particles.body[p] = -1
+            particles.position[p] = ti.math.vec3(AWAY)
 
 
 @kernel

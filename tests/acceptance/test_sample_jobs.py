@@ -37,6 +37,7 @@ TINY = {
     "jelly_and_ball": {"soft.jelly.cell_size": 0.03},
     "leaves_in_wind": {"rigid.maple.count": 4, "rigid.birch.count": 4, "rigid.oak.count": 4},
     "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},
+    "sand_castle": {"soft.castle.cell_size": 0.03, "fluid.sea.particle_radius": 0.02},
     "smoke_in_box": {"smoke.plume.cell_size": 0.016},
     "smoke_moving_duck": {"smoke.fog.cell_size": 0.06},
     "smoke_past_sphere": {"smoke.smoke.cell_size": 0.02},

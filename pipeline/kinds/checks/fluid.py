@@ -78,7 +78,7 @@ def _check_emitter(
     *,
     findings: Findings,
 ) -> None:
-    obstacles = [solid for place, solid in solids.items() if place[0] == "rigid"]
+    obstacles = [solid for place, solid in solids.items() if place[0] in ("rigid", "soft")]
     others = {format_path(place): other for place, other in earlier.items()}
     if reason := opening_problem(opening, job.fluid[0].spacing, job.domain, obstacles, others):
         findings.error(path, reason)

@@ -96,7 +96,7 @@ def _check_block(job: Job, path: KeyPath, solids: Solids, findings: Findings) ->
     if inside < ALL:
         findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the domain and are clipped")
     walls = [each for place, each in solids.items() if place[0] == "rigid"]
-    earlier = [each for place, each in solids.items() if place[0] == "fluid" and place < path]
+    earlier = [each for place, each in solids.items() if place[0] == "soft" or (place[0] == "fluid" and place < path)]
     held, outside_walls = (
         amount(solid, fluid.spacing, Surroundings.in_domain(job.domain, walls, others)) for others in (earlier, [])
     )

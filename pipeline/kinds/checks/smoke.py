@@ -257,7 +257,7 @@ def _check_air(job: Job, smoke: SmokeParameters, index: int, standing: Sequence[
         )
     blown = any(smoke.wind) or gusts.strength > 0.0
     driven = any(source.velocity is not None for source in smoke.source)
-    pushed = job.fluid or any(body.kind != "static" for body in job.rigid)
+    pushed = job.fluid or job.soft or any(body.kind != "static" for body in job.rigid)
     if not (any(job.gravity) or blown or driven or pushed):
         findings.warn(
             ("gravity",),
@@ -403,14 +403,16 @@ def _check_path(job: Job, path: KeyPath, solid: Solid, box: Box, findings: Findi
 
 
 def _check_what_fills_source(job: Job, path: KeyPath, source: Solid, solids: Solids, findings: Findings) -> None:
-    """Note a source wholly within water or a body that moves, as far as the corners of its box tell."""
+    """Note a source wholly within water, soft matter or a body that moves, as far as the corners of its box tell."""
     corners = np.array(np.meshgrid(*source.bounds.T)).reshape(3, 8).T
     followed = job.smoke[int(path[1])].source[int(path[3])].follow
     for other, solid in solids.items():
         body = job.rigid[int(other[1])] if other[0] == "rigid" else None
         is_own = body is not None and body.name == followed
         is_mover = body is not None and body.kind != "static"
-        if not (is_own or is_mover or other[0] == "fluid") or not touch(solid.bounds, source.bounds, margin=0.0):
+        if not (is_own or is_mover or other[0] in ("fluid", "soft")) or not touch(
+            solid.bounds, source.bounds, margin=0.0
+        ):
             continue
         if not (solid.signed_distance(corners) < 0.0).all():
             continue

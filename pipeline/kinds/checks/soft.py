@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.checks.shapes import mesh_exists
 from pipeline.model.amounts import rounded_up
 from pipeline.model.job import Job
+from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from sim.coupling.soft_openings import opening_of
+from sim.fluid.opening_conflicts import obstruction
 from sim.shapes.filled_volume import Surroundings, amount
 from sim.shapes.placement import PlacedSolid
-from sim.soft.parameters import SoftParameters, shared_conflicts
+from sim.soft.parameters import SoftParameters, coarse_for_fluid, shared_conflicts
 
 BYTES_PER_PARTICLE = 560
 """Of the solver with the nodes around a particle, and the snapshots and checkpoints that wait to be written."""
+BYTES_BESIDE_FLUID = 300
+"""Of a particle as a sample that fluid feels, on top."""
 FEWEST_CELLS = 3.0
 """Cells across a body, or a block, below which it is told: fewer bend, and are met, in no way that means much."""
+FINEST = 0.4
+"""Distance of particles over that of a fluid's below which it is told."""
 SHORTEST_STEP_S = 2.0e-6
 
 
@@ -48,8 +58,13 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
                 )
             filled.append(solid)
             total += particles
-    if refusal := budget.refusal(total, "particles of soft matter", BYTES_PER_PARTICLE):
+        total += sum(round(each.emitted_volume(math.inf) / soft.spacing**3) for each in soft.emitter)
+        _check_emitters(job, index, solids, findings)
+    each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0)
+    if refusal := budget.refusal(total, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
+    if job.soft and job.fluid:
+        _check_fluid(job.soft[0], job.fluid[0].spacing, findings)
     if job.soft:
         _check_bodies(solids, job.soft[0].cell_size, findings)
     return total
@@ -64,6 +79,42 @@ def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings)
             f"{soft.value('young_modulus'):.3g} Pa need steps of {step:.2g} s, "
             f"{rounded_up(1.0 / (job.fps * step)):,.0f} a frame; "
             f"{soft.value('young_modulus') * (step / SHORTEST_STEP_S) ** 2:.2g} Pa or less would do, or larger cells",
+        )
+
+
+def _check_emitters(job: Job, index: int, solids: Solids, findings: Findings) -> None:
+    """Refuse openings that are too narrow, outside the domain, or in bodies, and warn of those that come too late."""
+    soft = job.soft[index]
+    obstacles = [solid for path, solid in solids.items() if path[0] in ("rigid", "soft")]
+    for number, emitter in enumerate(soft.emitter):
+        path: KeyPath = ("soft", index, "emitter", number)
+        if not mesh_exists(emitter.shape, path, findings):
+            continue
+        try:
+            opening = opening_of(emitter, soft.spacing)
+        except ValueError as error:
+            findings.error((*path, "shape"), str(error).replace("particle_radius", "cell_size"))
+            continue
+        if reason := obstruction(opening, soft.spacing, job.domain, obstacles):
+            findings.error(path, reason)
+        if opening.start_s >= job.film_s:
+            findings.warn(
+                (*path, "start_s"), f"starts at {opening.start_s:g} s, after the film's end at {job.film_s:g} s"
+            )
+
+
+def _check_fluid(soft: SoftParameters, spacing: float, findings: Findings) -> None:
+    """Refuse cells that fluid of a spacing [m] would slip through, and warn of so fine ones that it gets slow."""
+    path = ("soft", 0, "cell_size")
+    if coarse := coarse_for_fluid(soft, spacing):
+        findings.error(path, coarse)
+    elif soft.spacing < FINEST * spacing:
+        felt = round(2.0 / 3.0 * np.pi * (2.0 * spacing / soft.spacing) ** 3)
+        findings.warn(
+            path,
+            f"of {soft.cell_size:g} m is far finer than the fluid, whose particles are {spacing:g} m apart: each of "
+            f"these feels some {felt} of soft matter where they touch; use {2.0 * spacing:.2g} m, or a smaller "
+            "fluid.particle_radius",
         )
 
 

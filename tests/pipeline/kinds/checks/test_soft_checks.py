@@ -63,15 +63,49 @@ def test_what_is_too_thin_for_the_grid_is_told_with_the_cells_that_would_do(tmp_
     assert "is 0.05 m thin, less than 3 cells of 0.02 m, and will be too stiff" in output
 
 
-@pytest.mark.parametrize(
-    ("other", "table"),
-    [
-        ("fluid", '[[fluid]]\nname = "water"\n[[fluid.block]]\nshape = { type = "sphere", radius = 0.1 }\n'),
-        ("cloth", '[[cloth]]\nname = "sheet"\nshape = { type = "rectangle", size = [0.3, 0.3], resolution = 0.05 }\n'),
-        ("smoke", '[[smoke]]\nname = "fog"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.1 }\n'),
-    ],
-)
-def test_a_kind_that_it_would_pass_through_is_refused_by_name(tmp_path, other, table):
-    code, output = told(tmp_path, JOB + table)
+def test_cloth_which_it_would_pass_through_is_refused_by_name(tmp_path):
+    cloth = '[[cloth]]\nname = "sheet"\nshape = { type = "rectangle", size = [0.3, 0.3], resolution = 0.05 }\n'
+    code, output = told(tmp_path, JOB + cloth)
     assert code == 2
-    assert f"soft[0]: meets walls and rigid bodies, and would pass through {other}; remove one of both" in output
+    told_in_words = "meets walls, rigid bodies, fluids and smoke, and would pass through cloth; remove one of both"
+    assert f"soft[0]: {told_in_words}" in output
+
+
+def test_cells_are_told_that_fluid_slips_through_or_that_are_far_finer_than_it(tmp_path):
+    fluid = '[[fluid]]\nname = "water"\nparticle_radius = 0.01\n[[fluid.block]]\n'
+    pool = JOB + fluid + 'shape = { type = "box", size = [1.0, 1.0, 0.1] }\nposition = [0.0, 0.0, 0.05]\n'
+    code, output = told(tmp_path, pool, "--set", "soft.jelly.cell_size=0.04")
+    assert code == 0
+    assert "warning" not in output  # water makes room for the jelly in it
+    code, output = told(tmp_path, pool, "--set", "soft.jelly.cell_size=0.06")
+    assert code == 2
+    assert (
+        "cell_size: of 0.06 m would let fluid through, whose particles are 0.02 m apart; use 0.05 m or less" in output
+    )
+    code, output = told(tmp_path, pool, "--set", "soft.jelly.cell_size=0.015")
+    assert code == 0
+    assert "each of these feels some 318 of soft matter where they touch; use 0.04 m" in output
+
+
+EMITTER = """\
+[[soft.emitter]]
+shape = { type = "disc", radius = 0.05 }
+position = [0.0, 0.0, 0.6]
+direction = [0.0, 0.0, -1.0]
+flow_rate = 0.004
+total_volume = 0.002
+"""
+
+
+def test_what_emitters_pour_is_counted_and_their_openings_are_looked_at(tmp_path):
+    code, output = told(tmp_path, JOB + EMITTER)
+    assert code == 0
+    assert "about 10,000 particles of soft matter" in output
+    for option, expected in (
+        ("position=[0.0,0.0,1.2]", "soft[0].emitter[0]: 78 of the 78 places of its opening are outside the domain"),
+        ("position=[0.0,0.0,0.1]", "78 of the 78 places of its opening are in a solid body; move it out"),
+        ("shape.radius=0.003", "soft[0].emitter[0].shape: is too narrow for particles 0.01 m apart; enlarge it or"),
+        ("start_s=2.0", "soft[0].emitter[0].start_s: starts at 2 s, after the film's end at 0.0333333 s"),
+    ):
+        _, output = told(tmp_path, JOB + EMITTER, "--set", f"soft.jelly.emitter.0.{option}")
+        assert expected in output

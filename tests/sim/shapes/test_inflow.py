@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from sim.fluid.inflow import Inflow
 from sim.fluid.opening import Opening
 from sim.fluid.parameters import EmitterParameters
+from sim.shapes.inflow import Inflow
 
 SPACING = 0.01
 SPOUT = {"shape": {"type": "disc", "radius": 0.03}, "position": (0, 0, 0.4), "direction": (0, 0, -1)}
