@@ -39,7 +39,7 @@ MOST_ROUNDS = 30  # in which a step is taken again because bodies broke in it
 
 
 @dataclass(frozen=True, eq=False)
-class _Faces:
+class Faces:
     """All faces between pieces, in the axes of their wholes, about the whole's own origin."""
 
     first: Indices  # numbers of the two bodies, (f,)
@@ -68,7 +68,8 @@ class Glue:
     Attributes:
         leader: number of the body that stands for all that a body is glued to, its own if for none, (n,).
         movers: bodies that move on their own, at the numbers of their leaders; others mean nothing.
-        is_broken: (f,) bool.
+        faces: all faces between pieces, (f,).
+        is_broken: of these, (f,) bool.
     """
 
     def __init__(
@@ -79,8 +80,8 @@ class Glue:
         self._centre = np.array([geometry.centre_of_mass for geometry in geometries])
         self._is_piece = np.array([body.whole is not None for body in parameters])
         self._impact_s = np.array([1.0 if body.breaks is None else body.breaks.impact_s for body in parameters])
-        self._faces = _faces_of(parameters)
-        self.is_broken = np.zeros(len(self._faces.first), dtype=bool)
+        self.faces = _faces_of(parameters)
+        self.is_broken: NDArray[np.bool_] = np.zeros(len(self.faces.first), dtype=bool)
         self.leader, self._arm = np.arange(n), np.zeros((n, 3))
         self._known: dict[int, _Component] = {}
         self._rest, self._blow = np.zeros((n, 6)), np.zeros((n, 6))  # force [N] and last blow [N s] on each piece
@@ -122,7 +123,7 @@ class Glue:
     def weigh(self) -> None:
         """Find what holds together, and its masses, of what is not broken and of the pieces' masses."""
         holds, n = ~self.is_broken, len(self.leader)
-        groups = groups_of(self._faces.first[holds], self._faces.second[holds], n)
+        groups = groups_of(self.faces.first[holds], self.faces.second[holds], n)
         lowest = np.full(n, n)
         np.minimum.at(lowest, groups, np.arange(n))
         self.leader, self._known = lowest[groups], {}
@@ -274,7 +275,7 @@ class Glue:
         turned = rotation.matrices(movers.orientation[leader])
         spin = turned.T @ movers.angular_velocity[leader]
         arms, mass, tensors = self._arm[pieces], bodies.mass[pieces], bodies.tensors[pieces]
-        strength = self._faces.strength[found.faces]
+        strength = self.faces.strength[found.faces]
         farthest = float(np.square(arms).sum(axis=1).max())
         density = mass.sum() / found.size**3
         if not force[pieces].any() and density * (spin @ spin) * farthest < CENTRIFUGAL_SHARE * strength.min():
@@ -289,7 +290,7 @@ class Glue:
         torque = torque - (tensors @ spin_up + np.cross(spin, tensors @ spin))
         load = np.concatenate([own_force, torque / found.size], axis=1)[1:].ravel()
         traction = (found.traction @ found.stiffness.solve(load)).reshape(-1, 3) / found.size**2
-        faces = self._faces
+        faces = self.faces
         normal = faces.normal[faces.corner_face[found.corners]]
         pull = np.einsum("ci,ci->c", traction, normal)
         shear = np.square(traction - pull[:, None] * normal).sum(axis=1)
@@ -301,7 +302,7 @@ class Glue:
 
     def _component(self, leader: int) -> _Component:
         """The stiffness of what a leader leads."""
-        faces = self._faces
+        faces = self.faces
         pieces = np.flatnonzero(self.leader == leader)
         holds = ~self.is_broken & (self.leader[faces.first] == leader)
         corners = np.flatnonzero(holds[faces.corner_face])
@@ -385,7 +386,7 @@ def _kron3(matrix: csc_matrix) -> Any:
     return kron(matrix, identity(3))
 
 
-def _faces_of(parameters: Sequence[RigidBodyParameters]) -> _Faces:
+def _faces_of(parameters: Sequence[RigidBodyParameters]) -> Faces:
     """The faces between all pieces of bodies."""
     first, second, strength, normal, triangles = [], [], [], [], []
     wholes: dict[str, list[int]] = {}
@@ -405,7 +406,7 @@ def _faces_of(parameters: Sequence[RigidBodyParameters]) -> _Faces:
     corners = np.concatenate([np.zeros((0, 3, 3)), *triangles])
     sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = 0.5 * np.linalg.norm(np.cross(*sides), axis=1)
-    return _Faces(
+    return Faces(
         np.array(first, dtype=np.int64),
         np.array(second, dtype=np.int64),
         np.array(strength),

@@ -201,7 +201,7 @@ class RigidSolver:
         if forces is None or not self.bodies.is_dynamic.any():
             return None
         on = forces.on([(body.name, body.group) for body in parameters])
-        return OuterForces(on, parameters, self.solids) if on.accelerates or on.blows else None
+        return OuterForces(on, parameters, self.solids, self.glue) if on.accelerates or on.blows else None
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]; groups of bodies that are too fast for it by several steps of their own."""
