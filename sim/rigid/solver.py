@@ -161,10 +161,14 @@ class RigidSolver:
     def mobility(self) -> tuple[Array, Array]:
         """How easily impulses move bodies: inverse masses [1/kg], (n,), and inertia tensors in world axes, (n, 3, 3).
 
-        Of what joints hold to something that stands or is led, as far as they let it; joints between free bodies are
-        not foreseen.
+        Of what is glued together that of all of it, by its leader; 0 for the others. Of what joints hold to something
+        that stands or is led, as far as they let it; joints between free bodies are not foreseen.
         """
-        inverse_mass, inverse_inertia = self.bodies.inverse_mass, self.bodies.inverse_inertia()
+        glue = self.glue
+        movers = self.bodies if glue is None else glue.movers
+        inverse_mass, inverse_inertia = movers.inverse_mass, movers.inverse_inertia()
+        if glue is not None:
+            inverse_mass[~glue.is_leader], inverse_inertia[~glue.is_leader] = 0.0, 0.0
         if self.joints is not None:
             self.joints.reduce_mobility(self.bodies, inverse_mass, inverse_inertia)
         return inverse_mass, inverse_inertia
@@ -172,6 +176,12 @@ class RigidSolver:
     def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
         """Those of some pairs of bodies, the lower number first, that no joint keeps from touching, (p,) each."""
         return self._detector.touching(first, second)
+
+    def apply_impulses(self, linear: Array, angular: Array) -> None:
+        """Change velocities of dynamic bodies, and of what they are glued to, by impulses [N s], [N m s], (n, 3)."""
+        self.bodies.apply_impulses(linear, angular)
+        if self.glue is not None:
+            self.glue.share()
 
     def max_surface_speed(self) -> float:
         """Upper bound of the speed of any surface point [m/s]."""
@@ -208,6 +218,8 @@ class RigidSolver:
         bodies, start_s = self.bodies, self.time_s
         if self._outer_forces is not None:
             self._outer_forces.push(bodies, self.gravity, dt)
+            if self.glue is not None:
+                self.glue.share()
         if bodies.is_dynamic.any() and self.first_bad_quantity() is None:
             awake = self._awake(dt)
             for count, is_active in self._chooser.divided(self.poses(), dt, awake):
@@ -573,7 +585,7 @@ class RigidSolver:
             raise ValueError(f'"{body}" is kinematic: it goes where its keyframes lead it, and no force moves it')
         linear = np.zeros((len(self.bodies), 3))
         linear[number] = self.bodies.mass[number] * change
-        self.bodies.apply_impulses(linear, np.zeros_like(linear))
+        self.apply_impulses(linear, np.zeros_like(linear))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Poses, velocities, sleep, the clock, the contacts, and the forces that the next ones start from."""
