@@ -122,7 +122,7 @@ def with_fast_ball(parameters: SceneParameters) -> SceneParameters:
         "position": (high[0] + 0.5 * EDGE, *(0.5 * (low + high)[1:])),
     }
     document = parameters.model_dump(exclude_unset=True)
-    document["rigid"] = [*document["rigid"], divider, ball]
+    document["rigid"] = [divider, *document["rigid"], ball]  # the order of the others stays, and with it their bits
     document["domain"] = {**document["domain"], "max": (high[0] + 10.0 * EDGE, *high[1:])}
     return SceneParameters.model_validate(document)
 

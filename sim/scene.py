@@ -72,8 +72,8 @@ class SceneParameters(Parameters):
         return self
 
     @model_validator(mode="after")
-    def _breaks_in_dry_air(self) -> Self:
-        others = {"fluid": self.fluid, "cloth": self.cloth, "soft matter": self.soft, "forces": self.force}
+    def _breaks_beside_nothing_soft(self) -> Self:
+        others = {"cloth": self.cloth, "soft matter": self.soft}
         other = next((name for name, there in others.items() if there), None)
         for body in self.rigid:
             if body.whole is not None and other is not None:

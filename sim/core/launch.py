@@ -366,13 +366,13 @@ class HostArraysKernel(FastKernel):
 
     def later(self, *args: Any) -> Callable[[], Any]:
         """Launch; what is returned is called for the result."""
-        if not any(isinstance(value, np.ndarray) for value in flattened(args)):
-            return super().later(*args)
         program = self._enter_program()
+        used = self._used(args)
+        if not any(isinstance(used[index], np.ndarray) for index, _ in self._arrays):
+            return super().later(*args)
         if not self._on_cpu:
             result = self._primal(*flattened(args))
             return lambda: result
-        used = self._used(args)
         key = self._key(used)
         compiled = self._compiled.get(key)
         if compiled is None:
@@ -386,18 +386,22 @@ class HostArraysKernel(FastKernel):
             self._launches[key] = launch
         context, passed = launch.context, launch.numbers
         for index, place in self._arrays:
-            array, (kind, axes, of_elements) = used[index], self._host_types[place]
+            array, before = used[index], passed[index]
             if not isinstance(array, np.ndarray):
+                if isinstance(before, weakref.ref) and before() is array:
+                    continue
                 size, shape = array.arr.nelement() * array.arr.element_size(), array.shape
-                address = program.get_ndarray_data_ptr_as_int(array.arr)
-            elif array.dtype == kind and array.ndim == axes and array.flags.c_contiguous:
+                address, passed[index] = program.get_ndarray_data_ptr_as_int(array.arr), weakref.ref(array)
+            else:
+                kind, axes, of_elements = self._host_types[place]
+                if array.dtype != kind or array.ndim != axes or not array.flags.c_contiguous:
+                    raise TypeError(f"{self.__name__} got an array of {array.ndim} axes of {array.dtype}, takes {kind}")
                 size, shape = array.nbytes, array.shape[: axes - of_elements]
                 address = array.__array_interface__["data"][0]
-            else:
-                raise TypeError(f"{self.__name__} got an array of {array.ndim} axes of {array.dtype}, takes {kind}")
-            if passed[index] != (address, shape):
-                context.set_arg_external_array_with_shape(place, address, size, shape, 0)
+                if before == (address, shape):
+                    continue
                 passed[index] = address, shape
+            context.set_arg_external_array_with_shape(place, address, size, shape, 0)
         self._pass_numbers(context, used, passed)
         program.launch_kernel(executable, context)
         return functools.partial(self._result, program, None, context, 0)

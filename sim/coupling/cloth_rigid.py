@@ -48,7 +48,7 @@ class ClothRigidCoupling(Coupling):
     def exchange(self, dt: float) -> None:
         """Hand the cloth's impulses of its substep of dt [s] to the bodies."""
         linear, angular = (each[: len(self._rigid.bodies)] for each in self._contacts.take_impulses(dt))
-        self._rigid.bodies.apply_impulses(linear, angular)
+        self._rigid.apply_impulses(linear, angular)
 
     def follow(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Tell the cloth's contacts where the bodies are after a substep of dt [s]; 0 before the first."""

@@ -18,7 +18,7 @@ def with_emitters_on(
     """The fluids with their emitters on static bodies where these stand; only those on bodies that move still follow.
 
     Raises:
-        ValueError: an emitter follows a body that is not there.
+        ValueError: an emitter follows a body that is not there, or a piece of one that breaks.
     """
     by_name = {body.name: body for body in bodies}
     return tuple(
@@ -43,4 +43,6 @@ def emitter_on(
     if emitter.follow not in bodies:
         raise ValueError(f'{name}: no rigid body is named "{emitter.follow}"')
     body = bodies[emitter.follow]
+    if body.whole is not None:
+        raise ValueError(f'{name}: "{emitter.follow}" is a piece of a body that breaks, which no emitter can follow')
     return placed_on(emitter, body) if body.kind == "static" else emitter

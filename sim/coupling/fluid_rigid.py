@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from sim.core.motion import rotation
 from sim.core.solver import Coupling
 from sim.fluid.boundary import BodyStates, Boundary
 from sim.fluid.boundary_akinci2012 import BoundarySamples, sink_samples
@@ -41,7 +42,8 @@ class FluidRigidCoupling(Coupling):
     A coupled step: the fluid steps with the bodies where they are and sums its impulses on them; the bodies take the
     impulses, then gravity and contacts, and move; the fluid's samples of the bodies follow. Impulses are opposite pair
     by pair and bodies get exactly what the fluid lost, so that linear and angular momentum are kept to rounding.
-    Kinematic bodies push the fluid and feel nothing.
+    Kinematic bodies push the fluid and feel nothing. Pieces of a body that breaks are one body for the fluid as long as
+    they hold together, with one mass; what it does to each of them is told for itself, and stresses the others.
 
     Attributes:
         force: mean force of the fluid on each body in the last step [N], (n, 3); kinematic bodies have one too.
@@ -62,15 +64,25 @@ class FluidRigidCoupling(Coupling):
     def exchange(self, dt: float) -> None:
         """Hand the fluid's impulses of its substep of dt [s] to the bodies."""
         linear, angular = (each[: len(self._rigid.bodies)] for each in self._fluid.body_forces.take_impulses())
-        self._rigid.bodies.apply_impulses(linear, angular)
+        glue, bodies = self._rigid.glue, self._rigid.bodies
+        if glue is not None:  # from the centre of what they move with to their own
+            angular = angular - rotation.cross(bodies.position - glue.movers.position[glue.leader], linear)
+        self._rigid.apply_impulses(linear, angular)
         self.force = linear / dt
 
     def follow(self, dt: float) -> None:
         """Put the fluid's samples where the bodies are after a substep of dt [s]; 0 before the first."""
-        bodies = self._rigid.bodies
+        bodies, glue = self._rigid.bodies, self._rigid.glue
         for samples in self._deforming:
             samples.follow(self._rigid.time_s)
         states = BodyStates(bodies.position, bodies.rotation(), bodies.velocity, bodies.angular_velocity)
+        if glue is not None:
+            self._fluid.tank.boundary.glue(glue.leader, glue.arm)
+            leads = glue.is_leader[:, None]
+            states = states._replace(
+                position=np.where(leads, glue.movers.position, bodies.position),
+                velocity=np.where(leads, glue.movers.velocity, bodies.velocity),
+            )
         self._fluid.tank.move_bodies(states, elapsed_s=dt)
         self.resume()
 

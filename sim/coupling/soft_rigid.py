@@ -63,7 +63,7 @@ class SoftRigidCoupling(Coupling):
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Hand the impulses of the last substep to the bodies."""
         linear, angular = (each[: len(self._rigid.bodies)] for each in self._contacts.take_impulses())
-        self._rigid.bodies.apply_impulses(linear, angular)
+        self._rigid.apply_impulses(linear, angular)
 
     def follow(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Tell soft matter where the bodies are."""

@@ -56,7 +56,8 @@ class Summed(NamedTuple):
     """Forces on the samples, and their sums over the bodies."""
 
     force: Vectors  # on each moving sample [N], (moving,)
-    wrench: Floats  # force [N] and torque [N m] on each body, (bodies * 6,)
+    wrench: Floats  # force [N] and torque [N m] on each body and all that moves with it, (bodies * 6,)
+    own: Floats  # those on each body alone, about the same centre, (bodies * 6,)
     chunks: Chunks
 
 
@@ -104,7 +105,10 @@ class BodyForces:
         self._scratch = ti.ndarray(ti.i32, scan_scratch_length(samples))
         self.are_alone = self._are_compiled = False
         self.summed = Summed(
-            ti.Vector.ndarray(3, ti.f32, samples), ti.ndarray(ti.f32, bodies * WRENCH_WIDTH), samples_of
+            ti.Vector.ndarray(3, ti.f32, samples),
+            ti.ndarray(ti.f32, bodies * WRENCH_WIDTH),
+            ti.ndarray(ti.f32, bodies * WRENCH_WIDTH),
+            samples_of,
         )
         self._kept = ti.ndarray(ti.f32, KEPT * bodies * WRENCH_WIDTH)
         self._kept_dt: list[float] = []
@@ -210,7 +214,10 @@ class BodyForces:
         return self._rows(copied(self.summed.wrench))
 
     def take_impulses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Impulses on the bodies since the last call [N s], and angular ones [N m s], (bodies, 3) each."""
+        """Impulses on the bodies since the last call [N s], and angular ones [N m s], (bodies, 3) each.
+
+        The latter are about the centre of mass of what each moves with.
+        """
         self._count_impulses()
         taken, self._impulse = self._impulse, np.zeros_like(self._impulse)
         return taken[:, :3], taken[:, 3:]
@@ -313,7 +320,7 @@ def gather_forces(near: NearParticles, exerted: Exerted, force: Vectors):
 
 @func
 def sum_over_bodies(samples: Samples, bodies: Bodies, summed: Summed):
-    """Force and torque about the centre of mass of each body, chunk by chunk, always in the same order."""
+    """Force and torque about the centre of mass of what each body moves with, chunk by chunk, in the same order."""
     chunks, force = ti.static((summed.chunks, summed.force))
     for chunk in range(chunks.count):
         s = bodies.body[chunks.start[chunk]] * STATE_WIDTH
@@ -331,6 +338,12 @@ def sum_over_bodies(samples: Samples, bodies: Bodies, summed: Summed):
         total = 0.0
         for chunk in range(chunks.of_body[of_body], chunks.of_body[of_body + 1]):
             total += chunks.wrench[chunk * WRENCH_WIDTH + entry % WRENCH_WIDTH]
+        summed.own[entry] = total
+    for entry in range(bodies.count * WRENCH_WIDTH):
+        mover = entry // WRENCH_WIDTH
+        total = 0.0
+        for member in range(bodies.first_member[mover], bodies.first_member[mover + 1]):
+            total += summed.own[bodies.members[member] * WRENCH_WIDTH + entry % WRENCH_WIDTH]
         summed.wrench[entry] = total
 
 
@@ -375,7 +388,7 @@ def react_to_others(
     """Forces on samples of bodies that count, for dt [s]: kept from `first` on, and samples that answer move on."""
     sum_over_bodies(samples, bodies, summed)
     for entry in range(bodies.count * WRENCH_WIDTH):
-        kept[first + entry] = summed.wrench[entry]
+        kept[first + entry] = summed.own[entry]
     if ti.static(bodies_answer):
         push(samples, bodies, summed.wrench, mobility, ti.math.vec3(0.0), dt)
 
@@ -400,7 +413,7 @@ def react_to_forces(
     gather_forces(near, exerted, summed.force)
     sum_over_bodies(exerted.fluid.samples, bodies, summed)
     for entry in range(bodies.count * WRENCH_WIDTH):
-        kept[first + entry] = summed.wrench[entry]
+        kept[first + entry] = summed.own[entry]
     if ti.static(bodies_answer):
         push(exerted.fluid.samples, bodies, summed.wrench, mobility, ti.math.vec3(0.0), dt)
     if ti.static(with_sheets):

@@ -94,7 +94,7 @@ class BodyResponse:
         put(self._mobility.inverse_mass, rows.ravel())
         turning = np.trace(inverse_inertia, axis1=1, axis2=2) * self._boundary.reach**2
         cap = LARGEST_PUSH / self._discretization.spacing * np.sqrt(inverse_mass + turning)
-        particles = PARTICLES_PER_SAMPLE * (np.diff(self._boundary.body_start) + PARTICLES_PER_SAMPLE)
+        particles = PARTICLES_PER_SAMPLE * (self._boundary.sample_counts() + PARTICLES_PER_SAMPLE)
         scale = np.divide(LARGEST_SHARE, particles * cap, out=np.zeros_like(cap), where=cap > 0.0)
         put(self._mobility.cap, cap)
         put(self._mobility.share_scale, scale)

@@ -1,6 +1,7 @@
 """Boundary samples on the device: of walls and static bodies, then of bodies that move, then of sheets."""
 
 import math
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -42,8 +43,10 @@ class Bodies(NamedTuple):
 
     first: ti.i32  # index of the first sample of a body among all samples
     sample_count: ti.i32  # samples of all bodies
-    body: Integers  # number of the body of each moving sample, `NO_BODY` for those of sheets, (moving,)
+    body: Integers  # number of the body that each moving sample moves with, `NO_BODY` for those of sheets, (moving,)
     count: ti.i32  # bodies
+    members: Integers  # the bodies that move with the first, then those that move with the next, (bodies,)
+    first_member: Integers  # where those of each begin there, and the end, (bodies + 1,)
     states: Floats  # centre of mass, rotation, velocity and angular velocity of the first, then of the next body
 
 
@@ -120,7 +123,8 @@ class Boundary:
         bodies, sheets: which samples are of bodies, and of sheets, on the device.
         index: row in the fixed samples given of each fixed sample here, (fixed,), on the host.
         body_start: first moving sample of each body, (bodies + 1,), on the host.
-        reach: largest distance of a sample from the centre of mass of its body [m], (bodies,), on the host.
+        mover: number of the body that each moves with, its own unless it is glued to others, (bodies,), on the host.
+        reach: largest distance of a sample from the centre of mass of what it moves with [m], (bodies,), on the host.
         moving: the samples of moving bodies as they were given.
         deforming_speed: largest speed of samples in the frame of their body [m/s], (bodies,), on the host.
         moving_index: index of each of the sorted moving samples, (moving,), on the device.
@@ -176,8 +180,14 @@ class Boundary:
             sample_count=self.body_sample_count,
             body=on_device(np.concatenate([moving.body, no_body])),
             count=body_count,
+            members=on_device(np.arange(body_count, dtype=np.int32)),
+            first_member=on_device(np.arange(body_count + 1, dtype=np.int32)),
             states=ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH),
         )
+        self._discretization = discretization
+        self.mover = self._reference_mover = np.arange(body_count)
+        self._arm: NDArray[np.float64] | None = None  # of each body from what it moves with, as soon as some do
+        self._before: NDArray[np.float64] | None = None  # where samples were before bodies moved with others
         self.sheets = Sheets(self.fixed_count + self.body_sample_count, self.body_sample_count, self.sheet_count)
         self._offset, self.moving = on_device(moving.positions), moving
         self._host_offset = self._reference_offset = moving.positions
@@ -187,10 +197,7 @@ class Boundary:
         self._deformed_by = 0.0
         self.deforming_speed: NDArray[np.float64] = np.zeros(body_count)
         self.body_start: NDArray[np.int64] = np.searchsorted(moving.body, np.arange(body_count + 1))
-        distance = np.linalg.norm(moving.positions.astype(np.float64), axis=1)
-        self.reach: NDArray[np.float64] = np.array(
-            [distance[moving.body == body].max(initial=0.0) for body in range(body_count)]
-        )
+        self.reach = self._reach()
         self._host_states = self._reference_states = self.bodies.states.to_numpy()
         self._moving_cells = CellSort(grid, self.moving_count) if self.moving_count else None
         self._moving_ids = on_device(np.arange(self.moving_count, dtype=np.int32))
@@ -203,6 +210,61 @@ class Boundary:
     def count(self) -> int:
         """Samples of walls, of all bodies and of sheets."""
         return self.fixed_count + self.moving_count
+
+    def sample_counts(self) -> NDArray[np.int64]:
+        """Numbers of samples that move with each body, (bodies,)."""
+        return np.bincount(self.mover[self.moving.body], minlength=self.body_count)
+
+    def glue(self, mover: NDArray[np.int64], arm: NDArray[np.float64]) -> None:
+        """Let bodies move with others: with which, and how far from its centre of mass [m], (n,) and (n, 3).
+
+        Arms are in the axes that all have that move together; emitters' pistons, the last bodies, are left out. Samples
+        of what moves together count each other in their volumes. `place` puts them where they are then.
+        """
+        pistons = self.body_count - len(mover)
+        mover = np.append(mover, np.arange(len(mover), self.body_count))
+        arm = np.concatenate([arm, np.zeros((pistons, 3))])
+        known, self._arm = self._arm, arm
+        other = mover != self.mover
+        if known is not None:
+            other |= (arm != known).any(axis=1)
+        if not other.any():
+            return
+        is_new = np.isin(self.mover, self.mover[other]) | np.isin(mover, mover[other])
+        rows = np.flatnonzero(is_new[self.moving.body])
+        self._before = self._positions()
+        offset, volumes = self._host_offset.copy(), self._host_volume.copy()
+        own = self.moving.body[rows]
+        offset[rows] = self.moving.positions[rows].astype(np.float64) + arm[own]
+        glued = BoundarySamples(*(getattr(self.moving, field.name)[rows] for field in fields(BoundarySamples)))
+        glued = replace(glued, positions=offset[rows], body=mover[own].astype(np.int32))
+        volumes[rows] = glued.volumes(self._discretization.spacing, self._discretization.support_in_spacings)
+        self._put_deformed(offset, self._host_own_velocity, volumes)
+        self._put_movers(mover)
+
+    def _put_movers(self, mover: NDArray[np.generic]) -> None:
+        """Of samples whose offsets are put already."""
+        self.mover = np.asarray(mover, dtype=np.int64)
+        order = np.argsort(self.mover, kind="stable")
+        put(self.bodies.members, order)
+        put(self.bodies.first_member, np.searchsorted(self.mover[order], np.arange(self.body_count + 1)))
+        no_body = np.full(self.sheet_count, NO_BODY)
+        put(self.bodies.body, np.concatenate([self.mover[self.moving.body], no_body]))
+        self.reach = self._reach()
+
+    def _reach(self) -> NDArray[np.float64]:
+        reach = np.zeros(self.body_count)
+        distance = np.linalg.norm(self._host_offset.astype(np.float64), axis=1)
+        np.maximum.at(reach, self.mover[self.moving.body], distance)
+        return reach
+
+    def _positions(self) -> NDArray[np.float64]:
+        """Where the samples of bodies are, by the states on the host [m], (m, 3)."""
+        states = states_of(self._host_states.astype(np.float64))
+        of_samples = self.mover[self.moving.body]
+        arms = np.einsum("nij,nj->ni", states.rotation[of_samples], self._host_offset.astype(np.float64))
+        result: NDArray[np.float64] = states.position[of_samples] + arms
+        return result
 
     def deform(
         self,
@@ -253,14 +315,22 @@ class Boundary:
         # Two rotations by an angle a apart differ by 2 sqrt(2) sin(a/2), and points at a distance of 1 by 2 sin(a/2).
         turned = np.linalg.norm(moved[:, 3:12], axis=1) / math.sqrt(2.0)
         deformed_by, self._deformed_by = self._deformed_by, 0.0
+        if self._before is not None:  # samples may have another body now, whose state moved otherwise
+            moved_by = np.linalg.norm(self._positions() - self._before, axis=1)
+            deformed_by, self._before = max(deformed_by, float(moved_by.max(initial=0.0))), None
         return float((np.linalg.norm(moved[:, :3], axis=1) + turned * self.reach).max()) + deformed_by
 
-    def checkpoint(self) -> dict[str, NDArray[np.float32]]:
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Where the bodies and sheets are, and where they were when the moving samples were sorted last."""
-        arrays = {"body_states": self.bodies.states.to_numpy(), "reference_body_states": self._reference_states.copy()}
+        arrays: dict[str, NDArray[np.generic]] = {
+            "body_states": self.bodies.states.to_numpy(),
+            "reference_body_states": self._reference_states.copy(),
+        }
         if self._own_velocity is not None:
             arrays["body_offsets"], arrays["reference_body_offsets"] = self._host_offset, self._reference_offset
             arrays["body_offset_velocities"], arrays["body_volumes"] = self._host_own_velocity, self._host_volume
+        if self._arm is not None:
+            arrays["body_movers"], arrays["reference_body_movers"] = self.mover, self._reference_mover
         if self.sheet_count:
             own = slice(self.sheets.first, self.count)
             arrays["sheet_position"] = self.samples.position.to_numpy()[own].copy()
@@ -276,6 +346,8 @@ class Boundary:
             self._put_deformed(
                 arrays["reference_body_offsets"], arrays["body_offset_velocities"], arrays["body_volumes"]
             )
+        if self._arm is not None:
+            self._put_movers(arrays["reference_body_movers"])
         self._place(arrays["reference_body_states"])
         if self.sheet_count:
             self._put_sheets(self.samples.position, arrays["reference_sheet_position"])
@@ -286,6 +358,9 @@ class Boundary:
         if self._own_velocity is not None:
             self._put_deformed(arrays["body_offsets"], arrays["body_offset_velocities"], arrays["body_volumes"])
             self._deformed_by = 0.0
+        if self._arm is not None:
+            self._put_movers(arrays["body_movers"])
+            self._before = None
         self._place(arrays["body_states"])
         if self.sheet_count:
             self._put_sheets(self.samples.position, arrays["sheet_position"])
@@ -309,6 +384,7 @@ class Boundary:
         if self._moving_cells is None or self._moving_points is None:
             return None
         self._reference_states, self._reference_offset = self._host_states, self._host_offset
+        self._reference_mover = self.mover
         sort_moving_samples(
             self.samples,
             self.fixed_count,

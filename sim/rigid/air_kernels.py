@@ -20,21 +20,45 @@ class Samples(NamedTuple):
     areas: Numbers  # [m²], (m,)
 
 
+@bundle
+class Whole(NamedTuple):
+    """What each body moves with: what it is glued to, or itself, (n,)."""
+
+    position: Rows  # of its centre of mass [m], (n, 3)
+    inverse_mass: Numbers  # [1/kg]
+    inverse_inertia: Rows  # tensors in the world's axes, row by row [1/(kg m²)], (n, 9)
+
+
 @kernel_of_host_arrays
 def push_bodies(
-    forces: ForceTable, samples: Samples, drag: Numbers, moving: Moving, dt: ti.f64, change: Rows, lost: Numbers
+    forces: ForceTable,
+    samples: Samples,
+    drag: Numbers,
+    moving: Moving,
+    whole: Whole,
+    dt: ti.f64,
+    given: Rows,
+    pressed: Rows,
+    slowing: Rows,
+    lost: Numbers,
 ):
-    """What dt [s] adds to each body's velocity and spin, (n, 6), after the part of them that drag takes, (n,).
+    """What forces from outside do to each body.
 
     See `air.OuterForces`; `drag` is 1/2 rho C of a body [kg/m³], (n,).
+
+    Args:
+        given: accelerations [m/s²], (n, 3).
+        pressed: force [N] of air and torque about its own centre of mass [N m], (n, 6).
+        slowing: at what rates air slows how the whole moves and turns, by this part of it [1/s], (n, 2).
+        lost: part of the velocities that drag takes in dt [s], (n,).
     """
     count = moving.position.shape[0]
     each = samples.areas.shape[0] // count
     for b in range(count):
-        if moving.inverse_mass[b] > 0.0:
+        if whole.inverse_mass[b] > 0.0:
             centre, turn = vector_in(moving.position, b), matrix_of(quaternion_in(moving.orientation, b))
             v, omega = vector_in(moving.velocity, b), vector_in(moving.angular_velocity, b)
-            ease = turn @ moving.inverse_tensor[b] @ turn.transpose()
+            to_whole = centre - vector_in(whole.position, b)
             at = ti.cast(centre, ti.f32)
             push, twist = Vector3(0.0), Vector3(0.0)
             rate, turning_rate = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
@@ -45,16 +69,18 @@ def push_bodies(
                     blows = -(air - v - omega.cross(arm)).dot(normal)
                     if blows > 0.0:
                         slope = drag[b] * samples.areas[s] * blows
-                        lever = arm.cross(normal)
+                        lever, eased = (to_whole + arm).cross(normal), Vector3(0.0)
+                        for row in ti.static(range(3)):
+                            for column in ti.static(range(3)):
+                                eased[row] += whole.inverse_inertia[b, 3 * row + column] * lever[column]
                         push -= slope * blows * normal
-                        twist -= slope * blows * lever
-                        rate += 2.0 * slope * moving.inverse_mass[b]
-                        turning_rate += 2.0 * slope * lever.dot(ease @ lever)
-            share = dt / (1.0 + dt * ti.max(rate, turning_rate))
-            given = acceleration_at(forces, b, at, True) + acceleration_at(forces, b, at, False)
-            linear = dt * ti.cast(given, ti.f64) + share * moving.inverse_mass[b] * push
-            angular = share * (ease @ twist)
+                        twist -= slope * blows * arm.cross(normal)
+                        rate += 2.0 * slope * whole.inverse_mass[b]
+                        turning_rate += 2.0 * slope * lever.dot(eased)
+            acceleration = acceleration_at(forces, b, at, True) + acceleration_at(forces, b, at, False)
             for axis in ti.static(range(3)):
-                change[b, axis] = linear[axis]
-                change[b, 3 + axis] = angular[axis]
+                given[b, axis] = ti.cast(acceleration[axis], ti.f64)
+                pressed[b, axis] = push[axis]
+                pressed[b, 3 + axis] = twist[axis]
+            slowing[b, 0], slowing[b, 1] = rate, turning_rate
             lost[b] = ti.cast(kept_off(ti.cast(drag_at(forces, b, at) * dt, ti.f32)), ti.f64)

@@ -160,6 +160,21 @@ class CollisionDetector:
             fill(near.before, np.arange(count, dtype=np.int32))
             self._is_renewed = False
 
+    def misses(self, velocity: Array, turning: Array, least: float) -> bool:
+        """Whether bodies may meet in the step, of which contacts were not looked for as they got faster by others.
+
+        Args:
+            velocity: of all bodies times the step [m], (n + 1, 3).
+            turning: how far their farthest points turn about centres of mass, or deform [m], (n + 1,).
+            least: by how much farther than looked for they get at least, in shortest edges [-].
+        """
+        from sim.rigid.step_kernels import count_missed
+
+        count, missed = len(self._pairs), np.zeros(1, dtype=np.int32)
+        if count:
+            count_missed(count, self._near.pairs, self._bodies, velocity, turning, least, missed)
+        return bool(missed[0])
+
     def look(self, poses: Poses, motion: Array) -> None:
         """See to it that all pairs are known that may get near where surfaces may get so far [m], (n + 1,)."""
         put(self._bodies.pose, np.concatenate([poses.position, poses.rotation.reshape(-1, 9)], axis=1))

@@ -169,12 +169,12 @@ class ContactResponse:
         from sim.rigid.step_kernels import count_bouncing
 
         _, _, on_device, placed = detector.on_device()
-        moving, bouncing = bodies.moving(), np.zeros(1, dtype=np.int32)
-        restitution = np.append(self._surfaces.restitution, 0.0)
+        velocity, angular_velocity = map(np.ascontiguousarray, (bodies.velocity, bodies.angular_velocity))
+        bouncing, restitution = np.zeros(1, dtype=np.int32), np.append(self._surfaces.restitution, 0.0)
         fall, slowest = dt * self._gravity[None], slowest_bounce(self._gravity, dt)
         count_bouncing(
-            detector.contact_count, placed, on_device, moving.velocity, moving.angular_velocity, restitution, fall,
-            slowest, dt, bouncing,
+            detector.contact_count, placed, on_device, velocity, angular_velocity, restitution, fall, slowest, dt,
+            bouncing,
         )  # fmt: skip
         return bool(bouncing[0])
 

@@ -39,7 +39,7 @@ MOST_ROUNDS = 30  # in which a step is taken again because bodies broke in it
 
 
 @dataclass(frozen=True, eq=False)
-class _Faces:
+class Faces:
     """All faces between pieces, in the axes of their wholes, about the whole's own origin."""
 
     first: Indices  # numbers of the two bodies, (f,)
@@ -67,8 +67,10 @@ class Glue:
 
     Attributes:
         leader: number of the body that stands for all that a body is glued to, its own if for none, (n,).
+        arm: from its leader's centre of mass to that of each body, in its own axes [m], (n, 3).
         movers: bodies that move on their own, at the numbers of their leaders; others mean nothing.
-        is_broken: (f,) bool.
+        faces: all faces between pieces, (f,).
+        is_broken: of these, (f,) bool.
     """
 
     def __init__(
@@ -79,9 +81,9 @@ class Glue:
         self._centre = np.array([geometry.centre_of_mass for geometry in geometries])
         self._is_piece = np.array([body.whole is not None for body in parameters])
         self._impact_s = np.array([1.0 if body.breaks is None else body.breaks.impact_s for body in parameters])
-        self._faces = _faces_of(parameters)
-        self.is_broken = np.zeros(len(self._faces.first), dtype=bool)
-        self.leader, self._arm = np.arange(n), np.zeros((n, 3))
+        self.faces = _faces_of(parameters)
+        self.is_broken: NDArray[np.bool_] = np.zeros(len(self.faces.first), dtype=bool)
+        self.leader, self.arm = np.arange(n), np.zeros((n, 3))
         self._known: dict[int, _Component] = {}
         self._rest, self._blow = np.zeros((n, 6)), np.zeros((n, 6))  # force [N] and last blow [N s] on each piece
         self._was_hit = np.zeros(n, dtype=bool)  # whether a blow began in the last step
@@ -98,7 +100,7 @@ class Glue:
         )
         self.weigh()
         led = self._is_piece & self.is_leader
-        arms = np.einsum("nij,nj->ni", bodies.rotation(), self._arm)
+        arms = np.einsum("nij,nj->ni", bodies.rotation(), self.arm)
         self.movers.position = np.where(led[:, None], bodies.position - arms, bodies.position)
         self.scatter()
 
@@ -122,7 +124,7 @@ class Glue:
     def weigh(self) -> None:
         """Find what holds together, and its masses, of what is not broken and of the pieces' masses."""
         holds, n = ~self.is_broken, len(self.leader)
-        groups = groups_of(self._faces.first[holds], self._faces.second[holds], n)
+        groups = groups_of(self.faces.first[holds], self.faces.second[holds], n)
         lowest = np.full(n, n)
         np.minimum.at(lowest, groups, np.arange(n))
         self.leader, self._known = lowest[groups], {}
@@ -132,8 +134,8 @@ class Glue:
             mine = pieces[self.leader[pieces] == leader]
             total = mass[mine].sum()
             centre = mass[mine] @ self._centre[mine] / total
-            self._arm[mine] = self._centre[mine] - centre
-            arms = self._arm[mine]
+            self.arm[mine] = self._centre[mine] - centre
+            arms = self.arm[mine]
             squares = np.einsum("ni,ni->n", arms, arms)[:, None, None] * np.eye(3)
             spread = mass[mine, None, None] * (squares - arms[:, :, None] * arms[:, None, :])
             self.movers.set_inertia(int(leader), float(total), (tensors[mine] + spread).sum(axis=0))
@@ -143,7 +145,7 @@ class Glue:
         self.is_broken[faces] = True
         self.weigh()
         bodies, movers, at = self._bodies, self.movers, np.flatnonzero(self._is_piece & self.is_leader)
-        arms = np.einsum("nij,nj->ni", rotation.matrices(bodies.orientation[at]), self._arm[at])
+        arms = np.einsum("nij,nj->ni", rotation.matrices(bodies.orientation[at]), self.arm[at])
         movers.position[at] = bodies.position[at] - arms
         movers.orientation[at] = bodies.orientation[at]
         movers.velocity[at] = bodies.velocity[at] - rotation.cross(bodies.angular_velocity[at], arms)
@@ -169,7 +171,7 @@ class Glue:
         turned = bodies.rotation()[changed]
         angular = np.einsum("nij,njk,nlk,nl->ni", turned, bodies.tensors[changed], turned, turn[changed])
         self._pushes[changed] += np.concatenate([linear, angular], axis=1)
-        arms = np.einsum("nij,nj->ni", turned, self._arm[changed])
+        arms = np.einsum("nij,nj->ni", turned, self.arm[changed])
         sums = np.zeros((2, len(bodies), 3))
         np.add.at(sums[0], self.leader[changed], linear)
         np.add.at(sums[1], self.leader[changed], angular + rotation.cross(arms, linear))
@@ -179,17 +181,24 @@ class Glue:
         asleep = glued & self.is_leader & bodies.is_asleep
         movers.velocity[asleep] = movers.angular_velocity[asleep] = 0.0
 
+    def share(self) -> None:
+        """Let all that a body is glued to take part in pushes that it got, at once."""
+        bodies = self._bodies
+        bodies.wake(np.bincount(self.leader, weights=~bodies.is_asleep)[self.leader] > 0.0)
+        self.gather()
+        self.scatter()
+
     def _velocities(self) -> Array:
         """Velocities of all bodies as their leaders move them [m/s], (n, 3)."""
         movers, leader = self.movers, self.leader
-        arms = np.einsum("nij,nj->ni", movers.rotation()[leader], self._arm)
+        arms = np.einsum("nij,nj->ni", movers.rotation()[leader], self.arm)
         result: Array = movers.velocity[leader] + rotation.cross(movers.angular_velocity[leader], arms)
         return result
 
     def scatter(self) -> None:
         """Put all bodies where their leaders have them."""
         bodies, movers, leader = self._bodies, self.movers, self.leader
-        arms = np.einsum("nij,nj->ni", movers.rotation()[leader], self._arm)
+        arms = np.einsum("nij,nj->ni", movers.rotation()[leader], self.arm)
         bodies.position = movers.position[leader] + arms
         bodies.orientation = movers.orientation[leader]
         bodies.velocity = self._velocities()
@@ -273,8 +282,8 @@ class Glue:
         pieces, none = found.pieces, np.zeros(0, dtype=np.int64)
         turned = rotation.matrices(movers.orientation[leader])
         spin = turned.T @ movers.angular_velocity[leader]
-        arms, mass, tensors = self._arm[pieces], bodies.mass[pieces], bodies.tensors[pieces]
-        strength = self._faces.strength[found.faces]
+        arms, mass, tensors = self.arm[pieces], bodies.mass[pieces], bodies.tensors[pieces]
+        strength = self.faces.strength[found.faces]
         farthest = float(np.square(arms).sum(axis=1).max())
         density = mass.sum() / found.size**3
         if not force[pieces].any() and density * (spin @ spin) * farthest < CENTRIFUGAL_SHARE * strength.min():
@@ -289,7 +298,7 @@ class Glue:
         torque = torque - (tensors @ spin_up + np.cross(spin, tensors @ spin))
         load = np.concatenate([own_force, torque / found.size], axis=1)[1:].ravel()
         traction = (found.traction @ found.stiffness.solve(load)).reshape(-1, 3) / found.size**2
-        faces = self._faces
+        faces = self.faces
         normal = faces.normal[faces.corner_face[found.corners]]
         pull = np.einsum("ci,ci->c", traction, normal)
         shear = np.square(traction - pull[:, None] * normal).sum(axis=1)
@@ -301,7 +310,7 @@ class Glue:
 
     def _component(self, leader: int) -> _Component:
         """The stiffness of what a leader leads."""
-        faces = self._faces
+        faces = self.faces
         pieces = np.flatnonzero(self.leader == leader)
         holds = ~self.is_broken & (self.leader[faces.first] == leader)
         corners = np.flatnonzero(holds[faces.corner_face])
@@ -385,7 +394,7 @@ def _kron3(matrix: csc_matrix) -> Any:
     return kron(matrix, identity(3))
 
 
-def _faces_of(parameters: Sequence[RigidBodyParameters]) -> _Faces:
+def _faces_of(parameters: Sequence[RigidBodyParameters]) -> Faces:
     """The faces between all pieces of bodies."""
     first, second, strength, normal, triangles = [], [], [], [], []
     wholes: dict[str, list[int]] = {}
@@ -405,7 +414,7 @@ def _faces_of(parameters: Sequence[RigidBodyParameters]) -> _Faces:
     corners = np.concatenate([np.zeros((0, 3, 3)), *triangles])
     sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = 0.5 * np.linalg.norm(np.cross(*sides), axis=1)
-    return _Faces(
+    return Faces(
         np.array(first, dtype=np.int64),
         np.array(second, dtype=np.int64),
         np.array(strength),

@@ -80,6 +80,10 @@ class PartsDetector:
         """Find the contacts of all active bodies in poses, and at a time [s]."""
         self._inner.find(self._of_parts(poses), motion[self._of_part], is_active[self._of_part[:-1]], time_s)
 
+    def misses(self, velocity: Array, turning: Array, least: float) -> bool:
+        """Whether parts may meet in the step, of which contacts were not looked for."""
+        return self._inner.misses(velocity[self._of_part], turning[self._of_part], least)
+
     def contacts(self) -> Contacts:
         """Those found last of active bodies, by pair of parts, told of movers."""
         found = self._inner.contacts()

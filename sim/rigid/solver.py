@@ -45,6 +45,10 @@ gravity gives in the largest step: 2 mm/s on Earth, by which they get 1 mm in th
 MOST_HALVINGS = 4
 """How often a step is halved until joints find where they hold at its end: whips of light links may turn fast."""
 
+MOST_LOOKS, LEAST_MISSED = 16, 0.01
+"""How often contacts of a step are looked for again as others made bodies faster, and by how much farther they have to
+get for that, in shortest edges: this is how deep they may get into each other."""
+
 LOST_DISTANCE = 10.0  # a dynamic body farther from the domain's centre, in diagonals, is stopped: it fell out of sight
 
 SOLVER_NAME = "rigid"
@@ -138,6 +142,7 @@ class RigidSolver:
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
         self._radius = np.array([geometry.radius for geometry in self.solids])
+        self._edge = np.array([geometry.shortest_edge for geometry in self.solids])
         self._largest_dt = largest_dt(parameters)
         self.time_s = 0.0
         self.begin_frame(0.0)
@@ -156,10 +161,14 @@ class RigidSolver:
     def mobility(self) -> tuple[Array, Array]:
         """How easily impulses move bodies: inverse masses [1/kg], (n,), and inertia tensors in world axes, (n, 3, 3).
 
-        Of what joints hold to something that stands or is led, as far as they let it; joints between free bodies are
-        not foreseen.
+        Of what is glued together that of all of it, by its leader; 0 for the others. Of what joints hold to something
+        that stands or is led, as far as they let it; joints between free bodies are not foreseen.
         """
-        inverse_mass, inverse_inertia = self.bodies.inverse_mass, self.bodies.inverse_inertia()
+        glue = self.glue
+        movers = self.bodies if glue is None else glue.movers
+        inverse_mass, inverse_inertia = movers.inverse_mass, movers.inverse_inertia()
+        if glue is not None:
+            inverse_mass[~glue.is_leader], inverse_inertia[~glue.is_leader] = 0.0, 0.0
         if self.joints is not None:
             self.joints.reduce_mobility(self.bodies, inverse_mass, inverse_inertia)
         return inverse_mass, inverse_inertia
@@ -167,6 +176,12 @@ class RigidSolver:
     def touching(self, first: Indices, second: Indices) -> tuple[Indices, Indices]:
         """Those of some pairs of bodies, the lower number first, that no joint keeps from touching, (p,) each."""
         return self._detector.touching(first, second)
+
+    def apply_impulses(self, linear: Array, angular: Array) -> None:
+        """Change velocities of dynamic bodies, and of what they are glued to, by impulses [N s], [N m s], (n, 3)."""
+        self.bodies.apply_impulses(linear, angular)
+        if self.glue is not None:
+            self.glue.share()
 
     def max_surface_speed(self) -> float:
         """Upper bound of the speed of any surface point [m/s]."""
@@ -196,13 +211,15 @@ class RigidSolver:
         if forces is None or not self.bodies.is_dynamic.any():
             return None
         on = forces.on([(body.name, body.group) for body in parameters])
-        return OuterForces(on, parameters, self.solids) if on.accelerates or on.blows else None
+        return OuterForces(on, parameters, self.solids, self.glue) if on.accelerates or on.blows else None
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]; groups of bodies that are too fast for it by several steps of their own."""
         bodies, start_s = self.bodies, self.time_s
         if self._outer_forces is not None:
             self._outer_forces.push(bodies, self.gravity, dt)
+            if self.glue is not None:
+                self.glue.share()
         if bodies.is_dynamic.any() and self.first_bad_quantity() is None:
             awake = self._awake(dt)
             for count, is_active in self._chooser.divided(self.poses(), dt, awake):
@@ -221,10 +238,14 @@ class RigidSolver:
         is_active: NDArray[np.bool_],
         halvings: int = MOST_HALVINGS,
         rounds: int = MOST_ROUNDS,
+        looked_for: Array | None = None,
+        looks: int = MOST_LOOKS,
     ) -> None:
         """Advance free bodies, (n,), by dt [s], and kinematic ones from a time [s] on; by halves if joints ask it.
 
-        Where bodies break, the step is taken again from its start by what is left of them, in some rounds.
+        Where bodies break, the step is taken again from its start by what is left of them, in some rounds. So it is
+        where contacts make bodies so fast that they meet others of which no contacts were looked for: these are looked
+        for as far as surfaces may get by their own speed, or so far [m], (n,).
         """
         self._set_mean_velocities_of_kinematic_bodies(time_s, dt)
         bodies, glue, everybody = self.bodies, self.glue, is_active
@@ -239,7 +260,9 @@ class RigidSolver:
         if glue is not None:
             glue.scatter()
         moves = everybody | ~bodies.is_dynamic
-        reach = self._with_obstacles(np.where(moves, dt * self._surface_speeds(), 0.0))
+        reach = np.where(moves, dt * self._surface_speeds(), 0.0)
+        if looked_for is not None:
+            reach = np.maximum(reach, looked_for)
         among = np.append(everybody, np.zeros(len(self._fixed_position) - 1, dtype=bool))
         ease = np.zeros((len(bodies) + 1, 7))
         bodies.describe(is_active, self._pose, ease)
@@ -249,7 +272,7 @@ class RigidSolver:
         points = None if joints is None else joints.points.state()
         if joints is not None:
             joints.points.push(dt)
-        self._detector.find(self._poses_described(), reach, among, time_s)
+        self._detector.find(self._poses_described(), self._with_obstacles(reach), among, time_s)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
         carried = partial(self._carried, time_s=time_s + 0.5 * dt) if self.deforming else None
         outcome = self._response.resolve(self._detector, bodies, dt, ease, joints, step, carried)
@@ -265,6 +288,18 @@ class RigidSolver:
                 self._obey_links()
                 self._advance(dt, time_s, everybody, halvings, rounds - 1)
                 return
+            glue.scatter()
+        if looks > 0:
+            got = np.where(moves, dt * self._surface_speeds(), 0.0)
+            if self._misses(dt, reach, got, moves):
+                if joints is not None and points is not None:
+                    joints.points.set_state(points)
+                bodies.velocity, bodies.angular_velocity = velocities
+                if glue is not None:
+                    glue.scatter()
+                self._advance(dt, time_s, everybody, halvings, rounds, np.maximum(reach, got), looks - 1)
+                return
+        if glue is not None:
             glue.settle()
         self._contact_count = self._detector.active_count()
         self._iterations += outcome.iterations
@@ -307,6 +342,18 @@ class RigidSolver:
             joints.settle(hold, bodies, is_active, bodies.inverse_inertia())
             if int(joints.is_broken.sum()) > broken:
                 self._obey_links()
+
+    def _misses(self, dt: float, reach: Array, got: Array, moves: NDArray[np.bool_]) -> bool:
+        """Whether bodies that move, (n,), may meet in dt [s] as contacts made them faster than was looked for.
+
+        Surfaces were thought to get so far, and may get so far [m], (n,) each.
+        """
+        if not np.any(got > reach + LEAST_MISSED * self._edge):
+            return False
+        bodies = self.bodies
+        turning = np.where(moves, dt * (bodies.spins() * self._radius + bodies.deforming), 0.0)
+        velocity = np.where(moves[:, None], dt * bodies.velocity, 0.0)
+        return self._detector.misses(self._with_obstacles(velocity), self._with_obstacles(turning), LEAST_MISSED)
 
     def _carried(self, contacts: Contacts, time_s: float) -> Carried:
         """The sides of contacts that are on surfaces that deform, with their velocities at a time [s]."""
@@ -447,7 +494,7 @@ class RigidSolver:
 
     def _with_obstacles(self, motion: Array) -> Array:
         """Motion of the moving bodies, and none of all others."""
-        return np.concatenate([motion, np.zeros(len(self._fixed_position))])
+        return np.concatenate([motion, np.zeros((len(self._fixed_position), *motion.shape[1:]))])
 
     def _surface_motion_since(self, position: Array, orientation: Array) -> Array:
         """Upper bound of how far surface points got [m], (n,); a turn by an angle a moves quaternions by 2 sin(a/4)."""
@@ -538,7 +585,7 @@ class RigidSolver:
             raise ValueError(f'"{body}" is kinematic: it goes where its keyframes lead it, and no force moves it')
         linear = np.zeros((len(self.bodies), 3))
         linear[number] = self.bodies.mass[number] * change
-        self.bodies.apply_impulses(linear, np.zeros_like(linear))
+        self.apply_impulses(linear, np.zeros_like(linear))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Poses, velocities, sleep, the clock, the contacts, and the forces that the next ones start from."""

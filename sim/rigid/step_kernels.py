@@ -7,7 +7,7 @@ import taichi as ti
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
 from sim.rigid.array_types import Numbers, Rows, Vector3, Whole, WholeRows
-from sim.rigid.collision_kernels import CONTACT_BAND, TRUSTED_MOTION, Bodies, Placed
+from sim.rigid.collision_kernels import CONTACT_BAND, FAR, TRUSTED_MOTION, Bodies, Placed, margin_of
 from sim.rigid.contact_kernels import row_of
 
 
@@ -81,6 +81,32 @@ def count_fast(
                 relative += apart.norm()
             if time_to(advance, relative, acceleration) < dt and (wall >= 0 or may_meet(one, two, bodies)):
                 fast[0] += 1
+
+
+@kernel_of_host_arrays
+def count_missed(
+    count: ti.i32, pairs: WholeRows, bodies: Bodies, velocity: Rows, turning: Numbers, least: ti.f64, missed: Whole
+):
+    """Count in `missed` those of so many pairs that get farther than was looked for, and whose boxes meet then.
+
+    Args:
+        pairs: those of `collision_kernels.Near`; walls are left out, as contacts with them are never far.
+        velocity: of all bodies, times the step [m], (b, 3).
+        turning: how far the farthest points turn about centres of mass, and move as bodies deform [m], (b,).
+        least: how much farther counts, in shortest edges of the smaller body [-].
+    """
+    for pair in range(count):
+        one, two = pairs[pair, 0], pairs[pair, 1]
+        if pairs[pair, 2] < 0:
+            away = row_of(velocity, one) - row_of(velocity, two)
+            turns = turning[one] + turning[two]
+            if away.norm() + turns > margin_of(one, two, bodies) + least * ti.min(bodies.size[one], bodies.size[two]):
+                apart = -ti.cast(FAR, ti.f64)
+                for axis in ti.static(range(3)):
+                    apart = ti.max(apart, bodies.box[one, axis] + away[axis] - bodies.box[two, 3 + axis])
+                    apart = ti.max(apart, bodies.box[two, axis] - away[axis] - bodies.box[one, 3 + axis])
+                if apart <= turns:
+                    missed[0] += 1
 
 
 @kernel_of_host_arrays

@@ -56,15 +56,16 @@ class StepChooser:
         """Take the moving bodies, which come first among the geometries."""
         self._geometries, self._bodies, self._walls = tuple(geometries), bodies, tuple(walls)
         self._detector, self._gravity = detector, gravity
-        self._radius = np.array([geometry.radius for geometry in geometries])
+        # Of all bodies, the domain last.
+        self._radius = np.array([*(geometry.radius for geometry in geometries), 0.0])
         self._edge = np.array([geometry.shortest_edge for geometry in geometries])
         is_dynamic = np.append(bodies.is_dynamic, np.zeros(len(geometries) - len(bodies), dtype=bool))
-        self._advance = np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR)
+        self._advance = np.append(np.where(is_dynamic, LARGEST_ADVANCE * 0.5 * self._edge, FAR), FAR)
         is_ball = [
             isinstance(each.solid.shape, Sphere) and np.abs(each.centre_of_mass).max() < 1.0e-9 * each.radius
             for each in geometries
         ]
-        self._ball = np.where(is_ball, 0.5 * self._edge, FAR)  # radii of what may bounce within a step
+        self._ball = np.append(np.where(is_ball, 0.5 * self._edge, FAR), FAR)  # radii of what may bounce within a step
         self._middle = np.array([_half_way(wall, walls) for wall in walls] or [FAR])
         self.links = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
@@ -168,10 +169,10 @@ class StepChooser:
             np.concatenate([bodies.velocity, np.zeros((still, 3))]),
             np.append(spin * self._radius[:n] + bodies.deforming, np.zeros(still)),
             np.append(own, np.zeros(still)),
-            np.append(self._advance, FAR),
+            self._advance,
             np.append(is_free, np.zeros(still)).astype(np.int32),
-            np.append(self._radius, 0.0),
-            np.append(self._ball, FAR),
+            self._radius,
+            self._ball,
         )
         near, _, moving, _ = detector.on_device()
         if not detector.pair_count:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from coupled_steps import CoupledSteps
 from numpy.typing import NDArray
-from small_fluids import EARTH, lattice
+from small_fluids import EARTH, EVERY_FACE, lattice
 
 from sim.core.domain import DomainParameters
 from sim.core.world import World
@@ -15,12 +15,14 @@ from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart
+from sim.rigid.groups import with_groups
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
 from sim.shapes.placement import build_solid
 
 SPACING = 0.02
 WEIGHTLESS = (0.0, 0.0, 0.0)
+OPEN_SPACE = DomainParameters(min=(-0.5,) * 3, max=(0.5,) * 3, open_faces=EVERY_FACE)
 
 
 class Tank(CoupledSteps):
@@ -38,7 +40,8 @@ class Tank(CoupledSteps):
         frames_per_second: float = 60.0,
         **material: object,
     ) -> None:
-        parameters = [RigidBodyParameters.model_validate({"name": f"body{k}", **body}) for k, body in enumerate(bodies)]
+        tables = [RigidBodyParameters.model_validate({"name": f"body{k}", **body}) for k, body in enumerate(bodies)]
+        parameters = with_groups(tables)
         self.rigid = RigidSolver(parameters, domain=domain, gravity=gravity)
         fluid = FluidParameters.model_validate(
             {"name": "water", "block": [{"shape": {"type": "box", "size": (1, 1, 1)}}], "solver": solver, **material}

@@ -61,6 +61,8 @@ def find(_: str, layers: int, most_frames: int) -> Found:
               "it falls: a tenth of them at least"),
         Check("share of the boxes that sleep in the end", series["asleep"][-1], 1.0, 0.0, "it comes to rest"),
         Check("when they do", rested_s, 0.0, most_frames / FRAMES_PER_SECOND, "within what is computed", "s"),
+        Check("deepest overlap in the blow", 1e-3 * max(series["depth_mm"]), 0.0, 2e-3,
+              "a fiftieth of an edge: twice what contacts are not looked for again for", "m"),
         Check("largest gain of energy in a frame over the ball's", max(0.0, float(rises.max())) / blow, 0.0, 1e-3,
               "contacts take energy; where the ball strikes, solves hit their limit, and moving overlaps apart lifts"),
         Check("deepest overlap once at rest", depth, 0.0, 1e-4, THOUSANDTH, "m"),

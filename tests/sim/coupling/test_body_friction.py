@@ -4,14 +4,12 @@ import itertools
 
 import numpy as np
 import pytest
-from coupled_tanks import WEIGHTLESS, Tank
-from small_fluids import EVERY_FACE
+from coupled_tanks import OPEN_SPACE, WEIGHTLESS, Tank
 
 from sim.core.domain import DomainParameters
 from sim.fluid.kernels import evaluate_slope
 from sim.fluid.viscosity import TOLERANCE
 
-OPEN_SPACE = DomainParameters(min=(-0.5,) * 3, max=(0.5,) * 3, open_faces=EVERY_FACE)
 STICKY = {"wall_friction": 1.0, "artificial_viscosity": 0.0, "viscosity_solver": "implicit"}
 
 

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from coupled_tanks import SPACING, Tank
-from small_fluids import EARTH, EVERY_FACE
+from coupled_tanks import OPEN_SPACE, SPACING, Tank
+from small_fluids import EARTH
 
 from sim.core.domain import DomainParameters
 from sim.fluid.solvers import SOLVERS
-
-OPEN_SPACE = DomainParameters(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5), open_faces=EVERY_FACE)
 
 
 @pytest.mark.parametrize("solver", sorted(SOLVERS))

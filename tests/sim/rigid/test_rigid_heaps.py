@@ -135,6 +135,24 @@ def test_a_pyramid_falls_when_it_is_hit_and_comes_to_rest():
     assert solver.bodies.position[boxes, 2].min() > 0.049
 
 
+@pytest.mark.parametrize(
+    ("edge", "density", "gap", "slowest"),
+    [(0.25, 3000.0, 1e-3, 5.0), (0.1, 3000.0, 4e-3, 2.5), (0.1, 500.0, 1e-3, 0.7)],
+)
+def test_what_is_hit_does_not_enter_the_next_of_a_row(edge, density, gap, slowest):
+    """Within a step it gets farther than to the next box, which it would not have met by its own speed."""
+    row = [body(f"box{k}", cube(0.1), ((0.1 + gap) * k, 0.0, 0.05), friction=0.5) for k in range(6)]
+    place = (-0.075 - 0.5 * edge, 0.0, 0.5 * edge)
+    hit = body("hit", cube(edge), place, velocity=(6.0, 0.0, 0.0), density=density, friction=0.5)
+    solver = in_room(*row, hit)
+    solver.has_own_steps = True
+    solver.begin_frame(0.0)
+    for _ in range(12):
+        solver.substep(1 / 540)
+    assert solver.bodies.velocity[:, 0].min() > slowest
+    assert solver.diagnostics()["max_penetration"] < 1e-4
+
+
 def test_hulls_in_a_bowl_come_to_rest_without_sinking_in(tmp_path):
     path = tmp_path / "hull.ply"
     points = np.random.default_rng(3).normal(size=(40, 3))
