@@ -232,18 +232,13 @@ class Boxes(NamedTuple):
 
 
 @bundle
-class PatchBounds(NamedTuple):
-    """Boxes of the patches at the start of the substep, and their motion in it."""
+class MovingPatches(NamedTuple):
+    """Patches as their motion is followed: where they are, and distances that they move and that lists allow for [m],
+    (m,) each."""
 
-    low: Vectors  # [m], (m,)
-    high: Vectors
+    corners: PatchNodes  # all nodes of their triangles
+    boxes: Boxes
     motion: PatchMotion
-
-
-@bundle
-class PatchBudget(NamedTuple):
-    """Distances that patches move, and that lists allow for [m], (m,) each."""
-
     moves: Floats  # largest distance of a vertex from the middle of all displacements
     change: Floats  # largest displacement by contacts
     margin: Floats  # how far contacts may displace
@@ -251,25 +246,6 @@ class PatchBudget(NamedTuple):
     spent: Floats  # sum over the substeps since the patches were paired
     travel: Floats  # `spent`, with this substep and `more`
     reach: Floats  # which `travel` may have until they are paired anew
-
-
-@bundle
-class MovingPatches(NamedTuple):
-    """Patches as their motion is followed."""
-
-    corners: PatchNodes  # all nodes of their triangles
-    bounds: PatchBounds
-    budget: PatchBudget
-
-
-@bundle
-class SubstepEnd(NamedTuple):
-    """Limits by which patches finish a substep."""
-
-    is_changed: ti.i32  # whether contacts displaced anything
-    astray: ti.f32  # largest distance of a vertex from where it was expected [m]
-    least_margin: ti.f32  # [m]
-    half_thickness: ti.f32  # [m]
 
 
 @bundle
@@ -309,20 +285,23 @@ class PatchPairArrays(NamedTuple):
 
 
 @bundle
-class Ageing(NamedTuple):
-    """What decides whether the list of a pair of patches is searched anew, or looked at."""
-
-    thickness: ti.f32  # the largest [m]
-    least_skin: ti.f32  # how far beyond to search at least [m]
-    first_due: Floats  # `PairPieces.piece_due`, (2 p,)
-
-
-@bundle
 class Counters(NamedTuple):
     """What threads count together."""
 
     taken: Integers  # items of each loop; see `sim.core.scheduling`
     found: Integers
+
+
+@bundle
+class Followed(NamedTuple):
+    """Patches and their pairs from substep to substep."""
+
+    nodes: TrackedNodes
+    patches: MovingPatches
+    met: PatchPairArrays
+    counters: Counters
+    thickness: ti.f32  # the largest [m]
+    astray: ti.f32  # largest distance of a vertex from where the substep before should have led it [m]
 
 
 # --- pairs of elements ----------------------------------------------------------------------------------------------
@@ -395,6 +374,21 @@ class Contacts(NamedTuple):
     friction: Floats  # Coulomb's coefficient [-]
     counter: Integers  # (4,)
     capacity: ti.i32
+
+
+@bundle
+class PairSearch(NamedTuple):
+    """What pairs of elements are listed and looked at with."""
+
+    counters: Counters
+    met: PatchPairArrays
+    boxes: Boxes
+    blocks: PatchBlocks
+    listed: PairPieces
+    surface: Surface
+    rest: Rest
+    recovery: ti.f32  # share of a missing distance that the substep gives back [-]
+    contacts: Contacts  # which pairs that meet are appended to
 
 
 @bundle

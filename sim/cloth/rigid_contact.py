@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import (
     CollidingBodies,
     Four,
+    MovingPatches,
     PatchLists,
     PatchMotion,
     PushedBodies,
@@ -285,13 +286,7 @@ class RigidContact:
         return min(at_most, 1.0 / max(float(rate), 1.0e-30))
 
     def find(
-        self,
-        state: ClothState,
-        patches: Patches,
-        motion: PatchMotion,
-        margin: ti.Ndarray,
-        contacts: ContactList,
-        recovery: float,
+        self, state: ClothState, patches: Patches, moving: MovingPatches, contacts: ContactList, recovery: float
     ) -> Callable[[], list[int]]:
         """Append what touches in this substep. Asks for the numbers of the list's counter, the first of which is how
         many contacts were found in all; that is 0 from then on.
@@ -299,29 +294,21 @@ class RigidContact:
         Args:
             state: at the start of a substep.
             patches: of the cloths.
-            motion: of them in it.
-            margin: how far contacts may displace each [m].
+            moving: how they move in it, and how far contacts may displace each.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
         is_alone, shows = not (self._walls.count or self.bodies.count), self._shows.any()
         lanes = on_gpu(LANES if shows else LANES_OF_VERTICES)
+        cloth = state.surface, state.inverse_mass, state.body
         return find_rigid_contacts.later(
             patches.lists,
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
             self._taken,
-            motion,
-            margin,
+            moving.motion,
+            moving.margin,
             self._largest_half,
-            Touching(
-                state.surface,
-                state.inverse_mass,
-                state.body,
-                self._walls,
-                self.bodies.colliding,
-                recovery,
-                contacts.found,
-            ),
+            Touching(*cloth, self._walls, self.bodies.colliding, recovery, contacts.found),
             SHOWN_BODIES if shows else BODIES if self.bodies.count else NO_BODIES,
         )
 

@@ -255,7 +255,7 @@ class ClothSolver:
         steps, and gains energy.
         """
         dt = min(self._asked_dt, self._free_dt / self._refinement)
-        return dt if self.contacts is None else self.contacts.stable_dt(self.state, dt)
+        return dt if self.contacts is None else self.contacts.stable_dt(dt)
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
@@ -295,7 +295,7 @@ class ClothSolver:
                 turns.measure()
             finish_step(state.nodes, state.position, state.limit, dt, reasons)
 
-        if self.contacts is None or not self.contacts.resolve(state, dt, turns, conclude):
+        if self.contacts is None or not self.contacts.resolve(dt, turns, conclude):
             conclude(self._no_reasons)
         excess = turns.excess
         self._excess = float(excess[self._refines].max(initial=0.0))
