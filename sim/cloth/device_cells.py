@@ -62,7 +62,7 @@ class DeviceCells:
             self.mesh.share.from_numpy((weight / np.bincount(nodes, weights=weight)[nodes]).astype(np.float32))
 
     def measure_strains(self, nodes: Nodes, *, is_damped: bool) -> None:
-        """Mean strains of the nodes of triangles, as they are, with what damping adds to them."""
+        """Mean strains of the nodes of triangles, as they are, with what damping adds to them if it shall."""
         if self.arity == TRIANGLE:
             measure_strains(self.on_device, self.count, self.mesh, self.own, nodes, int(is_damped))
 
@@ -101,12 +101,10 @@ def derivative(
     coefficients: Floats, cells: CellArrays, nodes: Nodes, displacement: Vectors, s: ti.i32, arity: ti.template()
 ) -> ti.math.vec3:
     """sum_a c_a x_a displaced; from differences, exact in integers, as sum_a c_a = 0."""
-    d = ti.math.vec3(0.0)
-    moved = ti.math.vec3(0.0)
+    d, moved = ti.math.vec3(0.0), ti.math.vec3(0.0)
     first = nodes.lattice[cells.nodes[arity * s]]
     for a in ti.static(range(arity)):
-        i = cells.nodes[arity * s + a]
-        c_a = coefficients[arity * s + a]
+        i, c_a = cells.nodes[arity * s + a], coefficients[arity * s + a]
         if ti.static(a > 0):
             d += c_a * ti.cast(nodes.lattice[i] - first, ti.f32)
         moved += c_a * displacement[i]
@@ -114,12 +112,14 @@ def derivative(
 
 
 @func
-def velocity_derivative(coefficients: Floats, cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()):
-    """sum_a c_a v_a [1/s]."""
-    rate = ti.math.vec3(0.0)
+def change_of(
+    coefficients: Floats, cells: CellArrays, vectors: Vectors, s: ti.i32, arity: ti.template()
+) -> ti.math.vec3:
+    """sum_a c_a of vectors at the nodes of a cell."""
+    total = ti.math.vec3(0.0)
     for a in ti.static(range(arity)):
-        rate += coefficients[arity * s + a] * nodes.velocity[cells.nodes[arity * s + a]]
-    return rate
+        total += coefficients[arity * s + a] * vectors[cells.nodes[arity * s + a]]
+    return total
 
 
 @func
@@ -226,8 +226,8 @@ def damp_shears(cells: CellArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, col
         for s in range(begin, end):
             d_u = derivative(cells.along, cells, nodes, nodes.carry, s, RECTANGLE)
             d_v = derivative(cells.across, cells, nodes, nodes.carry, s, RECTANGLE)
-            rate_u = velocity_derivative(cells.along, cells, nodes, s, RECTANGLE)
-            rate_v = velocity_derivative(cells.across, cells, nodes, s, RECTANGLE)
+            rate_u = change_of(cells.along, cells, nodes.velocity, s, RECTANGLE)
+            rate_v = change_of(cells.across, cells, nodes.velocity, s, RECTANGLE)
             _, by_u, by_v = shear_of(d_u, d_v)
             strength = cells.law[s][1] * cells.law[s][3] * dt
             change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v))
@@ -256,20 +256,36 @@ def tension_of(s: ti.i32, cells: CellArrays, mesh: MeshNodes, strain: Strains, m
     return cells.law[s][0] * (felt + cells.law[s][2] * felt.yx)
 
 
-@kernel
-def measure_strains(cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, is_damped: ti.i32):
-    """Strains of triangles, with tau times their rates if `is_damped`; then of nodes."""
+@func
+def strain_by(
+    displacement: Vectors,
+    is_damped: ti.i32,
+    cells: CellArrays,
+    count: ti.i32,
+    mesh: MeshNodes,
+    own: ti.i32,
+    nodes: Nodes,
+):
+    """Strains of triangles where displacements lead, with tau times their rates if `is_damped`; then of nodes. For the
+    outermost level of a kernel.
+    """
     for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
-        d_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
+        d_u = derivative(cells.along, cells, nodes, displacement, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, displacement, s, TRIANGLE)
         length, length_across = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
         mesh.strain[s] = ti.math.vec2(length - 1.0, length_across - 1.0)
         if is_damped:
-            rate_u = d_u.dot(velocity_derivative(cells.along, cells, nodes, s, TRIANGLE)) / length
-            rate_v = d_v.dot(velocity_derivative(cells.across, cells, nodes, s, TRIANGLE)) / length_across
+            rate_u = d_u.dot(change_of(cells.along, cells, nodes.velocity, s, TRIANGLE)) / length
+            rate_v = d_v.dot(change_of(cells.across, cells, nodes.velocity, s, TRIANGLE)) / length_across
             mesh.strain[s] = mesh.strain[s] + cells.law[s][3] * ti.math.vec2(rate_u, rate_v)
     for k in range(own):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
+
+
+@kernel
+def measure_strains(cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, is_damped: ti.i32):
+    """Strains of triangles and nodes as they are."""
+    strain_by(nodes.carry, is_damped, cells, count, mesh, own, nodes)
 
 
 @kernel
@@ -282,8 +298,8 @@ def compute_cell_forces(
     for s in range(count):
         d_u = derivative(cells.along, cells, nodes, nodes.carry, s, arity)
         d_v = derivative(cells.across, cells, nodes, nodes.carry, s, arity)
-        rate_u = velocity_derivative(cells.along, cells, nodes, s, arity)
-        rate_v = velocity_derivative(cells.across, cells, nodes, s, arity)
+        rate_u = change_of(cells.along, cells, nodes.velocity, s, arity)
+        rate_v = change_of(cells.across, cells, nodes.velocity, s, arity)
         law = cells.law[s]
         shear, by_u, by_v = shear_of(d_u, d_v)
         moment = -law[1] * (shear + law[3] * (by_u.dot(rate_u) + by_v.dot(rate_v)))

@@ -131,8 +131,7 @@ def measure_contraction(
         contraction.strain[k] = 0.0
     for s in range(count):
         i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (displacement[i] - displacement[j])
-        strain = d.norm() / springs.law[s][0] - 1.0
+        strain = between(i, j, nodes, displacement).norm() / springs.law[s][0] - 1.0
         for end in ti.static((i, j)):
             place = 2 * end + contraction.axis[s]
             ti.atomic_add(contraction.strain[place], contraction.share[place] * strain)
@@ -165,6 +164,21 @@ def colour_bounds(piece_of_colour: Integers, first: ti.i32, colours: ti.template
     return threads * ti.Vector(
         [piece_of_colour[first + ti.static(min(k, colours))] for k in ti.static(range(MOST_COLOURS_AT_ONCE + 1))]
     )
+
+
+@func
+def between(i: ti.i32, j: ti.i32, nodes: Nodes, displacement: Vectors) -> ti.math.vec3:
+    """x_i - x_j displaced [m]."""
+    return nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (displacement[i] - displacement[j])
+
+
+@func
+def span(springs: SpringArrays, nodes: Nodes, displacement: Vectors, s: ti.i32, arity: ti.template()) -> ti.math.vec3:
+    """sum_a c_a x_a displaced [m]."""
+    d = separation(springs, nodes, s, arity)
+    for a in ti.static(range(arity)):
+        d += coefficient(springs, s, arity, a) * displacement[springs.nodes[arity * s + a]]
+    return d
 
 
 @func

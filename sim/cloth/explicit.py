@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 
 from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, compute_cell_forces
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, span
 from sim.cloth.springs import longest_explicit_step
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
@@ -89,12 +89,9 @@ def compute_spring_forces(
 ):
     """-k (C + tau dC/dt) d/|d| of each spring [N]."""
     for s in range(count):
-        d = separation(springs, nodes, s, arity)
-        rate = ti.math.vec3(0.0)
+        d, rate = span(springs, nodes, nodes.carry, s, arity), ti.math.vec3(0.0)
         for a in ti.static(range(arity)):
-            c_a = coefficient(springs, s, arity, a)
-            d += c_a * nodes.carry[springs.nodes[arity * s + a]]
-            rate += c_a * nodes.velocity[springs.nodes[arity * s + a]]
+            rate += coefficient(springs, s, arity, a) * nodes.velocity[springs.nodes[arity * s + a]]
         length = d.norm()
         value = ti.math.vec3(0.0)
         if length > TINY_LENGTH:

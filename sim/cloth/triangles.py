@@ -4,7 +4,7 @@ import taichi as ti
 
 from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, TriangleSystem, TriangleWork
 from sim.cloth.cells import OWN_SHARE, TRIANGLE
-from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
+from sim.cloth.device_cells import DeviceCells, change_of, derivative, mean_strain, shear_of, strain_by, tension_of
 from sim.cloth.device_springs import TINY_LENGTH
 from sim.cloth.state import ClothState
 from sim.cloth.threads import LARGEST_RESIDUAL, STRAIGHTENED, direction_of
@@ -60,16 +60,8 @@ class TriangleSolver:
             moment=ti.Vector.ndarray(4, ti.f32, cells.chunks),
             shift=ti.Vector.ndarray(3, ti.f32, cells.pieces),
         )
-        self._system = TriangleSystem(
-            count,
-            cells.own,
-            cells.chunks,
-            cells.pieces,
-            cells.on_device,
-            cells.mesh,
-            with_room(TriangleFrames, count),
-            work,
-        )
+        numbers, frames = (count, cells.own, cells.chunks, cells.pieces), with_room(TriangleFrames, count)
+        self._system = TriangleSystem(*numbers, cells.on_device, cells.mesh, frames, work)
         self._expected = ti.Vector.ndarray(2, ti.f32, n)
         self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
         self._left = self._mass = self._least = 0.0
@@ -119,8 +111,8 @@ def stiffer(s: ti.i32, cells: CellArrays, rate: ti.f32) -> ti.f32:
 def strain(s: ti.i32, system: TriangleSystem, moved: Vectors, rate: ti.f32) -> ti.math.vec2:
     """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `frames`."""
     cells, frames = ti.static((system.cells, system.frames))
-    d_u = change_of(cells.along, cells, moved, s)
-    d_v = change_of(cells.across, cells, moved, s)
+    d_u = change_of(cells.along, cells, moved, s, TRIANGLE)
+    d_v = change_of(cells.across, cells, moved, s, TRIANGLE)
     n_u, n_v, turning = frames.n_u[s], frames.n_v[s], frames.turning[s]
     by_u, by_v = frames.by_u[s], frames.by_v[s]
     e_u, e_v = n_u.dot(d_u), n_v.dot(d_v)
@@ -142,15 +134,6 @@ def stretch(s: ti.i32, system: TriangleSystem, rate: ti.f32):
     tension *= stiffer(s, cells, rate)
     frames.s_u[s] = frames.s_u[s] + tension[0] * frames.n_u[s]
     frames.s_v[s] = frames.s_v[s] + tension[1] * frames.n_v[s]
-
-
-@func
-def change_of(coefficients: Floats, cells: CellArrays, vectors: Vectors, s: ti.i32) -> ti.math.vec3:
-    """sum_a c_a of vectors at the corners."""
-    total = ti.math.vec3(0.0)
-    for a in ti.static(range(TRIANGLE)):
-        total += coefficients[TRIANGLE * s + a] * vectors[cells.nodes[TRIANGLE * s + a]]
-    return total
 
 
 @func
@@ -360,18 +343,6 @@ def decrease(scalars: Floats, first: ti.i32, end: ti.i32) -> ti.math.vec2:
     return ti.math.vec2(last, whole)
 
 
-@func
-def measure_displaced(system: TriangleSystem, nodes: Nodes):
-    """Strains of triangles, then of nodes, where displacements lead; for the outermost level of a kernel."""
-    cells, mesh = ti.static((system.cells, system.mesh))
-    for s in range(system.count):
-        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
-        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
-        mesh.strain[s] = ti.math.vec2(d_u.norm() - 1.0, d_v.norm() - 1.0)
-    for k in range(system.own):
-        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
-
-
 @kernel
 def finish_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, expected: Strains):
     """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
@@ -400,18 +371,18 @@ def finish_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, exp
             x_i = work.x[i] - work.shift[mesh.piece[k]]
             elastic[i] = elastic[i] + x_i
             nodes.displacement[i] = nodes.displacement[i] + x_i
-    measure_displaced(system, nodes)
+    strain_by(nodes.displacement, 0, system.cells, system.count, mesh, system.own, nodes)
     for k in range(system.own):
         expected[mesh.node[k]] = mesh.mean[mesh.node[k]]
 
 
 @kernel
 def measure_node_excess(system: TriangleSystem, nodes: Nodes, expected: Strains, share: Share) -> Results:
-    """Largest excess of strain of nodes of triangles, as `threads.excess_of` has it, and how many along warp and weft
-    are beyond `LARGEST_RESIDUAL`.
+    """Largest excess of strain of nodes of triangles, as `threads.measure_excess` has it, and how many along warp and
+    weft are beyond `LARGEST_RESIDUAL`.
     """
     tree, mesh = ti.static((share.tree, system.mesh))
-    measure_displaced(system, nodes)
+    strain_by(nodes.displacement, 0, system.cells, system.count, mesh, system.own, nodes)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(tree.lanes):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
 from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, between, coefficient, colour_bounds, separation
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
 from sim.cloth.triangles import TriangleSolver
@@ -265,9 +265,8 @@ def solve_bend(s: ti.i32, springs: SpringArrays, nodes: Nodes, dt_squared: ti.f3
         impulse = -strength * error / (squared * (strength * weight * (1.0 + gamma) + 1.0)) * d
         for a in ti.static(range(arity)):
             i = springs.nodes[arity * s + a]
-            nodes.displacement[i] = (
-                nodes.displacement[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
-            )
+            push = nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
+            nodes.displacement[i] = nodes.displacement[i] + push
 
 
 @kernel
@@ -300,8 +299,7 @@ def damp_threads(springs: SpringArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32
             for s in range(springs.segment_start[piece], springs.segment_start[piece + 1]):
                 i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
                 w_i, w_j, v_i, v_j = nodes.inverse_mass[i], nodes.inverse_mass[j], nodes.velocity[i], nodes.velocity[j]
-                d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
-                d += nodes.carry[i] - nodes.carry[j]
+                d = between(i, j, nodes, nodes.carry)
                 squared, strength = d.dot(d), springs.law[s][1] * springs.law[s][2] * dt
                 if squared > TINY_LENGTH * TINY_LENGTH:
                     impulse = -strength / (strength * (w_i + w_j) + 1.0) * d.dot(v_i - v_j) / squared * d
