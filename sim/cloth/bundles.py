@@ -418,7 +418,7 @@ class Impulses(NamedTuple):
 
 @bundle
 class PushedNodes(NamedTuple):
-    """Nodes as contacts push them."""
+    """Nodes as contacts push them, and what is found of each as contacts are weighed."""
 
     displacement: Vectors  # [m], (n,)
     inverse_mass: Floats  # [1/kg], (n,)
@@ -427,12 +427,6 @@ class PushedNodes(NamedTuple):
     touched: Integers  # numbers of those that contacts push
     uses: Integers  # first and last place of each node in `Impulses.used_by`, (2 n,)
     support: Vectors  # see `contact_response`, (n,)
-
-
-@bundle
-class NodeSums(NamedTuple):
-    """Numbers of each node that are found as contacts are weighed."""
-
     counter: Integers  # contacts that push, their nodes, and uses; whether any misses much, is settled, (5,)
     predicted: Vectors  # displacement as contacts were looked for [m], (n,)
     shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
@@ -465,7 +459,6 @@ class Response(NamedTuple):
     contacts: Contacts
     impulses: Impulses
     nodes: PushedNodes
-    sums: NodeSums
     bodies: PushedBodies
 
 

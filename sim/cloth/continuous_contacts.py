@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import NodeSums, PushedNodes, Response
+from sim.cloth.bundles import PushedNodes, Response
 from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
@@ -78,9 +78,8 @@ class ContinuousContacts:
             displacement=state.displacement,
             inverse_mass=state.inverse_mass,
             uses=ti.ndarray(ti.i32, 2 * n),
-        )
-        self._sums: NodeSums = with_room(
-            NodeSums, n, counter=ti.ndarray(ti.i32, 5), held_sums=ti.ndarray(ti.i32, 6 * n)
+            counter=ti.ndarray(ti.i32, 5),
+            held_sums=ti.ndarray(ti.i32, 6 * n),
         )
         self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
@@ -132,13 +131,13 @@ class ContinuousContacts:
         self._pairs.begin_frame()
         self.rigid.set_thickness(float(copied(state.thickness).min()), self._pairs.thickness)
         self.rigid.bodies.begin_frame()
-        self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
+        self._substeps = self._found = self._repaired = self._zone_vertices = self._left = 0
         self._velocities: Callable[[], Box] | None = None
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())
 
     def diagnostics(self) -> Mapping[str, float]:
-        """Numbers of the frame: contacts, with watched pairs, and iterations a substep.
+        """Numbers of the frame: contacts a substep, with watched pairs.
 
         `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
         that had to move with others, `crossings_left` pairs that even so may have crossed, as where pins are led
@@ -151,7 +150,6 @@ class ContinuousContacts:
         is_jammed = self._moved_as_one > JAMMED_SHARE * max(self._substeps, 1) * nodes
         return {
             "contacts": self._found / max(self._substeps, 1),
-            "contact_iterations": self._iterations / max(self._substeps, 1),
             "repaired_crossings": float(self._repaired),
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
@@ -252,22 +250,17 @@ class ContinuousContacts:
             self._weigh(is_first=True)
             pushed = self._push(turns)
         while True:
-            found = pushed()
-            pushing, _, _, settled = found
+            pushing, is_missing, settled = pushed()
             if turns is None or not (pushing or settled) or not turns.relax():
                 break
-            self._iterations += STEPS if pushing else settled
             pushed = self._push(turns)
-        self._push_further(found)
+        if is_missing:
+            self._push_further()
 
-    def _push_further(self, found: Sequence[int]) -> None:
-        """More steps, where the round that `found` what `push` returns was not enough."""
-        pushing, _, is_missing, settled = found
-        self._iterations += STEPS if pushing else settled
-        if pushing and is_missing:
-            for step in range(0, MORE_ITERATIONS, STEPS):
-                self._push(first=step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
-            self._iterations += MORE_ITERATIONS
+    def _push_further(self) -> None:
+        """More steps, where those of a round were not enough."""
+        for step in range(0, MORE_ITERATIONS, STEPS):
+            self._push(first=step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
 
     def _weigh(self, *, is_first: bool) -> None:
         """Weigh contacts before they push; once for all rounds of what was found."""
@@ -290,7 +283,7 @@ class ContinuousContacts:
     @property
     def _response(self) -> Response:
         impulses = self._contacts.impulses(self._impulse_unit)
-        return Response(self._contacts.found, impulses, self._pushed, self._sums, self.rigid.bodies.pushed)
+        return Response(self._contacts.found, impulses, self._pushed, self.rigid.bodies.pushed)
 
     def _keep_apart(self, count: int) -> Sequence[int]:
         """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""
@@ -301,7 +294,8 @@ class ContinuousContacts:
                 return found
             self._repaired += found[0]
             self._weigh(is_first=False)
-            self._push_further(self._push()())
+            if self._push()()[1]:
+                self._push_further()
         found = self._finish(count)
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
@@ -316,7 +310,7 @@ class ContinuousContacts:
         return found if not found[0] else (found[0], *self._finish(0, is_changed=True)[1:])
 
     def _finish(self, count: int, *, is_changed: bool = False) -> Sequence[int]:
-        asked = self._pairs.finish(self._sums.predicted, self._contacts, count, is_changed=is_changed or count > 0)
+        asked = self._pairs.finish(self._pushed.predicted, self._contacts, count, is_changed=is_changed or count > 0)
         if self._conclude is not None:
             self._conclude(self._pairs.outcome)
             self._velocities = box_of(self._state.velocity, 0, self._state.vertex_count, self._ends)
