@@ -180,7 +180,7 @@ class SelfCollision:
         self.moving: MovingPatches = with_room(
             MovingPatches,
             m,
-            corners=self.patches.corner_lists,
+            corners=self.patches.corners,
             boxes=with_room(Boxes, m),
             motion=with_room(PatchMotion, m),
         )

@@ -223,11 +223,10 @@ class ClothSolver:
         """Numbers of a cloth's nodes in the scene."""
         if name not in self.state.names:
             raise ValueError(f'no cloth is named "{name}"; cloths are {", ".join(self.state.names)}')
-        first, last = self.state.host.first_node[self.state.names.index(name) :][:2]
-        numbers = np.unique(np.asarray(nodes, dtype=np.int64))
-        if not len(numbers) or numbers[0] < 0 or numbers[-1] >= last - first:
-            raise ValueError(f'nodes of cloth "{name}" are 0 to {last - first - 1}, got {list(nodes)}')
-        return numbers + first
+        rows, numbers = self._rows_of(name), np.unique(np.asarray(nodes, dtype=np.int64))
+        if not len(numbers) or numbers[0] < 0 or numbers[-1] >= rows.stop - rows.start:
+            raise ValueError(f'nodes of cloth "{name}" are 0 to {rows.stop - rows.start - 1}, got {list(nodes)}')
+        return numbers + rows.start
 
     def _change_to(self, parameters: tuple[ClothParameters, ...]) -> None:
         """Adopt parameters, or keep those that are there and raise ValueError if the solver cannot have them."""

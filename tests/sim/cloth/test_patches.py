@@ -33,8 +33,9 @@ def test_patches_share_out_every_element_once_and_know_all_corners():
     )
     host = solver.state.host
     patches = Patches(host)
-    triangles, edges = pieces(patches.triangles, patches.first_triangle), pieces(patches.edges, patches.first_edge)
-    vertices, corners = pieces(patches.vertices, patches.first_vertex), pieces(patches.corners, patches.first_corner)
+    lists, corners = patches.lists, pieces(patches.corners.nodes, patches.corners.first)
+    triangles, edges = pieces(lists.triangles, lists.first_triangle), pieces(lists.edges, lists.first_edge)
+    vertices = pieces(lists.vertices.nodes, lists.vertices.first)
     assert len(triangles) == patches.count > 2
     assert max(len(each) for each in triangles) <= TRIANGLES_PER_PATCH
     for parts, whole in ((triangles, host.triangles), (edges, host.edges.nodes)):
@@ -51,7 +52,7 @@ def test_patches_of_very_uneven_meshes_have_like_numbers_of_triangles():
     """Widths of the strips grow by a thousand; a grid of cells as wide as the widest would hold all the rest in one."""
     state = state_of(33)
     state.host.position[:, 0] = np.repeat(np.geomspace(1e-3, 1.0, 33)[None, :], 33, axis=0).ravel()
-    sizes = np.diff(Patches(state.host).first_triangle.to_numpy())
+    sizes = np.diff(Patches(state.host).lists.first_triangle.to_numpy())
     assert sizes.max() <= TRIANGLES_PER_PATCH
     assert sizes.min() >= TRIANGLES_PER_PATCH // 2
 
@@ -222,7 +223,7 @@ def test_one_wild_vertex_has_only_its_own_surroundings_watched():
 
 
 def corners_of(pairs: SelfCollision) -> list[np.ndarray]:
-    return pieces(pairs.patches.corners, pairs.patches.first_corner)
+    return pieces(pairs.patches.corners.nodes, pairs.patches.corners.first)
 
 
 def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
