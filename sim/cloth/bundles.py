@@ -59,32 +59,23 @@ class Rest(NamedTuple):
 
 @bundle
 class SpringArrays(NamedTuple):
-    """Springs of one family, s of them; a piece is one spring where they are solved one by one."""
+    """Springs of one family; a piece is one spring where they are solved one by one."""
 
+    count: ti.i32  # s
     nodes: Integers  # (arity s,)
     law: Laws  # rest length [m], stiffness [N/m], damping over stiffness [s], (s,)
     coefficients: Floats  # of springs with four nodes, (4 s,)
     shift: Floats  # what springs of threads count as longer, because of the strain across [m], (s,)
     segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
-    piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
-
-
-@bundle
-class CellArrays(NamedTuple):
-    """Cells with as many nodes each, s of them."""
-
-    nodes: Integers  # (arity s,)
-    along: Floats  # c_a of d_u [1/m], (arity s,)
-    across: Floats  # c_a of d_v [1/m], (arity s,)
-    law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
-    cell_of_colour: Integers  # first cell of each colour, and number of cells, (colours + 1,)
-    multiplier: Floats  # of the shear, (s,); rectangles only
 
 
 @bundle
 class MeshNodes(NamedTuple):
-    """Nodes of s triangles, o of them, piece by piece, in chunks of about as many nodes as there are chunks."""
+    """Nodes of s triangles, piece by piece, in chunks of about as many nodes as there are chunks."""
 
+    count: ti.i32  # o
+    chunks: ti.i32
+    pieces: ti.i32
     node: Integers  # number, (o,)
     start: Integers  # of each node in `corner`, (o + 1,)
     corner: Integers  # corner a of triangle s is 3 s + a
@@ -95,6 +86,19 @@ class MeshNodes(NamedTuple):
     piece: Integers  # (o,)
     chunk: Integers  # first node of each chunk, and o
     first_chunk: Integers  # of each piece, and number of chunks
+
+
+@bundle
+class CellArrays(NamedTuple):
+    """Cells with as many nodes each."""
+
+    count: ti.i32  # s
+    nodes: Integers  # (arity s,)
+    along: Floats  # c_a of d_u [1/m], (arity s,)
+    across: Floats  # c_a of d_v [1/m], (arity s,)
+    law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
+    multiplier: Floats  # of the shear, (s,); rectangles only
+    mesh: MeshNodes  # those of triangles; none of rectangles
 
 
 @bundle
@@ -133,12 +137,7 @@ class TriangleWork(NamedTuple):
 class TriangleSystem(NamedTuple):
     """What triangles are solved by together."""
 
-    count: ti.i32  # s
-    own: ti.i32  # o
-    chunks: ti.i32
-    pieces: ti.i32
     cells: CellArrays
-    mesh: MeshNodes
     frames: TriangleFrames
     work: TriangleWork
 

@@ -44,11 +44,11 @@ class ClothTotals:
         for springs in self._springs:
             springs.contract(state.nodes, state.carry)
             share = self._of_springs.over(springs.count)
-            found.append(sum_over_springs(springs.on_device, state.nodes, springs.count, springs.arity, share))
+            found.append(sum_over_springs(springs.on_device, state.nodes, springs.arity, share))
         for cells in self._cells:
             cells.measure_strains(state.nodes, is_damped=False)
-            share, law = self._of_springs.over(cells.count), (cells.on_device, cells.mesh)
-            found.append(sum_over_cells(*law, state.nodes, cells.count, cells.arity, share))
+            share = self._of_springs.over(cells.count)
+            found.append(sum_over_cells(cells.on_device, state.nodes, cells.arity, share))
         strains, energies = zip(*((float(each[0]), float(each[1])) for each in found), strict=True)
         return {"elastic_energy": sum(energies), "max_strain": max(0.0, *strains)}
 
@@ -89,7 +89,7 @@ def sum_over_nodes(
 
 
 @kernel
-def sum_over_springs(springs: SpringArrays, nodes: Nodes, count: ti.i32, arity: ti.template(), share: Share) -> Results:
+def sum_over_springs(springs: SpringArrays, nodes: Nodes, arity: ti.template(), share: Share) -> Results:
     """Largest strain of springs with two nodes; elastic energy."""
     (tree,) = ti.static((share.tree,))
     if ti.static(not runs_on_gpu()):
@@ -99,7 +99,7 @@ def sum_over_springs(springs: SpringArrays, nodes: Nodes, count: ti.i32, arity: 
         energy = 0.0
         for k in range(share.items):
             s = lane * share.lane_step + k * share.item_step
-            if s < count:
+            if s < springs.count:
                 error = span(springs, nodes, nodes.carry, s, arity).norm() - springs.law[s][0]
                 energy += 0.5 * springs.law[s][1] * error * (error + springs.shift[s])
                 if ti.static(arity == 2):
