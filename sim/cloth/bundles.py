@@ -281,14 +281,8 @@ class PatchPairArrays(NamedTuple):
     due: Integers  # numbers of the pairs of which elements have to be looked at
     expired: Integers  # numbers of those that have to be searched
     needed: Integers  # 1 for their patches, (m,)
-
-
-@bundle
-class Counters(NamedTuple):
-    """What threads count together."""
-
     taken: Integers  # items of each loop; see `sim.core.scheduling`
-    found: Integers
+    found: Integers  # what threads count together
 
 
 @bundle
@@ -298,7 +292,6 @@ class Followed(NamedTuple):
     nodes: TrackedNodes
     patches: MovingPatches
     met: PatchPairArrays
-    counters: Counters
     thickness: ti.f32  # the largest [m]
     astray: ti.f32  # largest distance of a vertex from where the substep before should have led it [m]
 
@@ -379,7 +372,6 @@ class Contacts(NamedTuple):
 class PairSearch(NamedTuple):
     """What pairs of elements are listed and looked at with."""
 
-    counters: Counters
     met: PatchPairArrays
     boxes: Boxes
     blocks: PatchBlocks

@@ -341,7 +341,6 @@ class ImpactZones:
 
     def __init__(self, mass: NDArray[np.float32], pinned: NDArray[np.bool_]) -> None:
         self._mass, self._pinned = mass.astype(np.float64), pinned
-        self._links: list[NDArray[np.int64]] = []
         self.labels = np.arange(len(mass))
 
     def join(self, crossing: NDArray[np.int32]) -> bool:
@@ -350,15 +349,13 @@ class ImpactZones:
         Args:
             crossing: vertices of the pairs, (m, 4).
         """
-        n = len(self._mass)
-        quadruples = crossing.astype(np.int64)
-        self._links += [np.stack([quadruples[:, 0], quadruples[:, k]], axis=1) for k in (1, 2, 3)]
-        links = np.unique(np.concatenate(self._links), axis=0)
-        graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-        count, labels = connected_components(graph, directed=False)
-        grew = count < len(np.unique(self.labels))
-        self.labels = labels
-        return grew
+        first, *others = self.labels[crossing].T
+        count = int(self.labels.max()) + 1
+        links = np.tile(first, 3), np.concatenate(others)
+        graph = coo_array((np.ones(len(links[0])), links), shape=(count, count))
+        found, zone_of_zone = connected_components(graph, directed=False)
+        self.labels = zone_of_zone[self.labels]
+        return bool(found < count)
 
     @property
     def members(self) -> NDArray[np.int64]:

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import Four, PairPieces, PairSearch, PatchBlocks, Two
+from sim.cloth.bundles import Four, PairPieces, PairSearch, PatchBlocks
 from sim.cloth.patches import BLOCK, FAR, NONE
 from sim.cloth.proximity import closest_on_edges, closest_on_triangle, distance_of_edges, distance_to_triangle, unit_or
 from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, append_contact, least_displacement
@@ -50,21 +50,6 @@ NEVER = -1.0e30
 SAFETY_OF_DUE = 1.0e-3
 """Part of the thickness by which pairs are listed, and looked at, earlier than they could have come near: a thousand
 times what sums of float32 lose, so that what is found does not depend on when lists were made."""
-
-
-@ti.func
-def share_no_vertex(e: Two, f: Two) -> ti.i32:
-    """Whether two edges have four different ends."""
-    nearest = ti.min(ti.abs(e[0] - f[0]), ti.abs(e[0] - f[1]), ti.abs(e[1] - f[0]), ti.abs(e[1] - f[1]))
-    return ti.cast(nearest > 0, ti.i32)
-
-
-@func
-def pair_thickness(a: ti.i32, b: ti.i32, at_rest: ti.f32, search: PairSearch) -> ti.f32:
-    """Distance that two elements keep [m]: between different cloths, or within one, where it is shorter at rest."""
-    rest, surface = ti.static((search.rest, search.surface))
-    wanted = 0.5 * (surface.thickness[a] + surface.thickness[b])
-    return ti.select(rest.cloth[a] == rest.cloth[b], ti.min(wanted, OF_REST_DISTANCE * at_rest), wanted)
 
 
 @ti.func
@@ -166,7 +151,7 @@ def pair_edges(p: ti.i32, thread: ti.i32, lanes: ti.i32, parts: ti.i32, search: 
                     there = block * BLOCK + lowest_bit(near)
                     near &= near - 1
                     f = blocks.edges[there]
-                    if share_no_vertex(e, f) == 1:
+                    if ti.min(ti.abs(e[0] - f[0]), ti.abs(e[0] - f[1]), ti.abs(e[1] - f[0]), ti.abs(e[1] - f[1])) > 0:
                         between = ti.math.vec3(blocks.mid_x[there], blocks.mid_y[there], blocks.mid_z[there]) - middle
                         far_half = ti.math.vec3(blocks.half_x[there], blocks.half_y[there], blocks.half_z[there])
                         apart = distance_of_edges(-half, half, between - far_half, between + far_half)
@@ -289,14 +274,16 @@ def look_at_pair(p: ti.i32, both: ti.i32, are_edges: ti.template(), search: Pair
         weight = ti.math.vec4(1.0, -shares[0], -shares[1], -shares[2])
     apart = weight[1] * x1 + weight[2] * x2 + weight[3] * x3
     distance = apart.norm()
-    if distance < ti.max(0.5 * (surface.thickness[v[0]] + surface.thickness[v[2]]), approach + allowed):
+    thickness = 0.5 * (surface.thickness[v[0]] + surface.thickness[v[2]])
+    if distance < ti.max(thickness, approach + allowed):
         u1, u2, u3 = surface.displacement[v[1]] - u, surface.displacement[v[2]] - u, surface.displacement[v[3]] - u
         mean = 0.25 * (u1 + u2 + u3)
         motion = ti.max(mean.norm(), (u1 - mean).norm(), (u2 - mean).norm(), (u3 - mean).norm())
         if listed.wanted[p] == UNKNOWN:
             a, b, c, d = at_rest[v[0]], at_rest[v[1]], at_rest[v[2]], at_rest[v[3]]
             apart_at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
-            listed.wanted[p] = pair_thickness(v[0], v[2], apart_at_rest, search)
+            is_own = search.rest.cloth[v[0]] == search.rest.cloth[v[2]]
+            listed.wanted[p] = ti.select(is_own, ti.min(thickness, OF_REST_DISTANCE * apart_at_rest), thickness)
         keeps = part * listed.wanted[p]
         if distance < ti.max(keeps, ti.min(2.0 * motion, approach) + allowed):
             across = x1.cross(x3 - x2) if ti.static(are_edges) else (x2 - x1).cross(x3 - x1)
@@ -380,16 +367,16 @@ def find_near_pairs(numbers: ti.math.ivec3, search: PairSearch):
     Args:
         numbers: whether to search, not if that is done, and only room was missing; most pairs of elements; workers
             (`sim.core.scheduling`) of a CPU's loops that have anything to do.
-        search: `counters` have how many pairs of patches are expired, and due, and whether the list of them does not
+        search: `met.found` has how many pairs of patches are expired, and due, and whether the list of them does not
             hold: then nothing is done. `needed` is 0 after; the second number that contacts count becomes the end that
             `listed` needs.
     """
-    counters, met, blocks, listed = ti.static((search.counters, search.met, search.blocks, search.listed))
+    met, blocks, listed = ti.static((search.met, search.blocks, search.listed))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     lanes, of_piece = ti.static(on_gpu(LANES), on_gpu(LANES_OF_PIECE))
     threads = ti.static(lanes * on_gpu(EDGE_PARTS))
-    holds = ti.cast(counters.found[2] == 0, ti.i32)
-    count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[2]
+    holds = ti.cast(met.found[2] == 0, ti.i32)
+    count, due_count, workers = holds * numbers[0] * met.found[0], holds * met.found[1], numbers[2]
     enclosing = searching = ti.min(count, 1) * workers
     due_end = whole_warps(due_count * of_piece)  # then those of edges, in warps of their own
     looking = ti.min(due_count, 1) * workers
@@ -398,24 +385,24 @@ def find_near_pairs(numbers: ti.math.ivec3, search: PairSearch):
         looking = 2 * due_end
     if count > 0:
         listed.ends[1] = 0
-    begin_sharing(counters.taken, 0)
+    begin_sharing(met.taken, 0)
     for worker in range(enclosing):
-        item = next_item(-1, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 0, ENCLOSED_AT_A_TIME)
         while item < blocks.vertices.count * lanes + count:
             if item >= blocks.vertices.count * lanes:
                 p = met.expired[item - blocks.vertices.count * lanes]
                 listed.pieces[2 * p][2], listed.pieces[2 * p + 1][2] = 0, 0
             elif met.needed[item // lanes] == 1:
                 enclose_elements(item // lanes, item % lanes, lanes, search.surface.position, blocks)
-            item = next_item(item, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
-    begin_sharing(counters.taken, 1)
+            item = next_item(item, worker, met.taken, 0, ENCLOSED_AT_A_TIME)
+    begin_sharing(met.taken, 1)
     for worker in range(searching):
-        item = next_item(-1, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 1, SEARCHED_AT_A_TIME)
         while item < 2 * count * threads:
             of_all = item // threads  # first vertices with triangles of all
             piece = 2 * met.expired[of_all % count] + of_all // count
             search_piece(piece, item % threads, search)
-            item = next_item(item, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
+            item = next_item(item, worker, met.taken, 1, SEARCHED_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for k in range(count):
@@ -428,15 +415,15 @@ def find_near_pairs(numbers: ti.math.ivec3, search: PairSearch):
     searching_again, looking_now = ti.min(short, 1) * workers, fits * looking
     if ti.static(runs_on_gpu()):
         searching_again = short * threads
-    begin_sharing(counters.taken, 2)
+    begin_sharing(met.taken, 2)
     for worker in range(searching_again):
-        item = next_item(-1, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 2, SEARCHED_AT_A_TIME)
         while item < short * threads:
             search_piece(listed.again[item // threads], item % threads, search)
-            item = next_item(item, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
-    begin_sharing(counters.taken, 3)
+            item = next_item(item, worker, met.taken, 2, SEARCHED_AT_A_TIME)
+    begin_sharing(met.taken, 3)
     for worker in range(looking_now):
-        item = next_item(-1, worker, counters.taken, 3, DUE_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 3, DUE_AT_A_TIME)
         while item < 2 * due_end:
             place = item % due_end // of_piece
             lane = ti.select(place < due_count, item % of_piece, NO_MORE)
@@ -445,6 +432,6 @@ def find_near_pairs(numbers: ti.math.ivec3, search: PairSearch):
                 look_at_piece(p, lane, of_piece, False, search)
             else:
                 look_at_piece(p, lane, of_piece, True, search)
-            item = next_item(item, worker, counters.taken, 3, DUE_AT_A_TIME)
+            item = next_item(item, worker, met.taken, 3, DUE_AT_A_TIME)
     listed.ends[1] = listed.ends[1] - short
     search.contacts.counter[1], search.contacts.counter[3] = listed.ends[0], holds * fits

@@ -5,10 +5,8 @@ launch: whether pairs may have crossed, and what of the lists is used up.
 import taichi as ti
 
 from sim.cloth.bundles import (
-    Boxes,
     BoxTree,
     Contacts,
-    Counters,
     Followed,
     KnownPairs,
     MovingPatches,
@@ -80,7 +78,7 @@ def look_at_patches(
         vertex_count, of_vertices: the vertices, and how lanes share them; 0 if patches have been looked at, and how far
             astray any is is known.
         still: see `fit_motion`.
-        followed: its patches get the motion, its counters the two numbers of pairs, and whether the list does not hold.
+        followed: its patches get the motion, `found` the two numbers of pairs, and whether the list does not hold.
         least_skin, first_due: see `age_pair`.
         workers: see `sim.core.scheduling`; for patches, and for their pairs.
 
@@ -88,10 +86,10 @@ def look_at_patches(
     displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
     not hold; and of how many some elements are due.
     """
-    nodes, patches, counters = ti.static((followed.nodes, followed.patches, followed.counters))
+    nodes, patches, met = ti.static((followed.nodes, followed.patches, followed.met))
     motion, tree = ti.static((patches.motion, of_vertices.tree))
     patches_end, pairs_end = workers[0], workers[1]
-    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
+    met.found[0], met.found[1], met.found[2] = 0, 0, 0
     for lane in range(tree.lanes):
         most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
         for k in range(of_vertices.items):
@@ -108,9 +106,9 @@ def look_at_patches(
     middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
     size = ti.math.vec3(ends[0] + ends[3], ends[1] + ends[4], ends[2] + ends[5])
     astray = ti.select(vertex_count > 0, ti.sqrt(ends[6]), followed.astray)
-    begin_sharing(counters.taken, 0)
+    begin_sharing(met.taken, 0)
     for worker in range(patches_end):
-        m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+        m = next_item(-1, worker, met.taken, 0, PATCHES_AT_A_TIME)
         while m < patches.corners.count:
             fit_motion(m, still, followed)
             patches.moves[m] = (1.0 + SAFETY) * (
@@ -118,19 +116,17 @@ def look_at_patches(
             )
             patches.travel[m] = patches.spent[m] + astray + patches.moves[m] + patches.more[m]
             if not patches.travel[m] <= patches.reach[m]:
-                counters.found[2] = 1
-            m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
-    begin_sharing(counters.taken, 1)
+                met.found[2] = 1
+            m = next_item(m, worker, met.taken, 0, PATCHES_AT_A_TIME)
+    begin_sharing(met.taken, 1)
     for worker in range(pairs_end):
-        end = ti.select(counters.found[2] == 0, followed.met.count, 0)
-        p = next_item(-1, worker, counters.taken, 1, PAIRS_AT_A_TIME)
+        end = ti.select(met.found[2] == 0, met.count, 0)
+        p = next_item(-1, worker, met.taken, 1, PAIRS_AT_A_TIME)
         while p < end:
             age_pair(p, followed, astray, least_skin, first_due)
-            p = next_item(p, worker, counters.taken, 1, PAIRS_AT_A_TIME)
-    expired = ti.select(counters.found[2] == 0, counters.found[0], -1)
-    return ti.math.ivec4(
-        ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, counters.found[1]
-    )
+            p = next_item(p, worker, met.taken, 1, PAIRS_AT_A_TIME)
+    expired = ti.select(met.found[2] == 0, met.found[0], -1)
+    return ti.math.ivec4(ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, met.found[1])
 
 
 @func
@@ -238,17 +234,16 @@ def pair_patches(
     now: PatchPairArrays,
     carried: Integers,
     capacity: ti.i32,
-    counters: Counters,
 ) -> ti.i32:
     """List the patches whose boxes in the tree meet, each pair once, and each patch with itself; returns how many
     there are.
 
     What was known before about a pair holds (`sort_known`): `carried` is its number there, or -1.
     """
-    counters.found[0] = 0
-    begin_sharing(counters.taken, 0)
+    now.found[0] = 0
+    begin_sharing(now.taken, 0)
     for worker in range(workers):
-        m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+        m = next_item(-1, worker, now.taken, 0, PATCHES_AT_A_TIME)
         while m < count:
             least, most = tree.low[tree.leaves + m], tree.high[tree.leaves + m]
             node = 1
@@ -263,15 +258,15 @@ def pair_patches(
                 else:
                     other = node - tree.leaves
                     if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
-                        slot = ti.atomic_add(counters.found[0], 1)
+                        slot = ti.atomic_add(now.found[0], 1)
                         if slot < capacity:
                             now.pairs[slot] = ti.Vector([m, other])
                     # On to the next node that is not below this one; 0 after the last.
                     while node % 2 == 1:
                         node = node // 2
                     node += ti.cast(node > 0, ti.i32)
-            m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
-    end = ti.min(counters.found[0], capacity)
+            m = next_item(m, worker, now.taken, 0, PATCHES_AT_A_TIME)
+    end = ti.min(now.found[0], capacity)
     for p in range(end):
         m, other, before = now.pairs[p][0], now.pairs[p][1], -1
         for place in range(known.first[2 * m], known.first[2 * m + 1]):
@@ -281,14 +276,7 @@ def pair_patches(
         if before >= 0:
             now.slack[p] = known.slack[before]
         now.wake[p], now.left[p], now.approach[p], now.allowed[p] = -1.0, FAR, 0.0, 0.0
-    return counters.found[0]
-
-
-@func
-def gap_of_boxes(m: ti.i32, other: ti.i32, boxes: Boxes) -> ti.f32:
-    """Distance of two patches' boxes [m]."""
-    between = ti.max(boxes.low[m] - boxes.high[other], boxes.low[other] - boxes.high[m], 0.0)
-    return between.norm()
+    return now.found[0]
 
 
 @func
@@ -322,7 +310,7 @@ def age_pair(p: ti.i32, followed: Followed, astray: ti.f32, least_skin: ti.f32, 
         first_due: `PairPieces.piece_due`, which is `NEVER` after this where a pair is due, as elements that are looked
             at get other numbers.
     """
-    met, patches, counter = ti.static((followed.met, followed.patches, followed.counters.found))
+    met, patches, counter = ti.static((followed.met, followed.patches, followed.met.found))
     thickness = followed.thickness
     m, other = met.pairs[p][0], met.pairs[p][1]
     if patches.travel[m] + patches.travel[other] > met.wake[p]:
@@ -332,7 +320,8 @@ def age_pair(p: ti.i32, followed: Followed, astray: ti.f32, least_skin: ti.f32, 
         met.slack[p] -= 2.0 * astray
         is_searched = False
         if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
-            gap = gap_of_boxes(m, other, patches.boxes) - (1.0 + SAFETY_OF_DUE) * thickness
+            low, high = ti.static((patches.boxes.low, patches.boxes.high))
+            gap = ti.max(low[m] - high[other], low[other] - high[m], 0.0).norm() - (1.0 + SAFETY_OF_DUE) * thickness
             if gap > whole + besides:
                 met.wake[p], met.slack[p] = (patches.spent[m] + patches.spent[other] + 2.0 * astray + gap, -1.0)
                 met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
@@ -356,7 +345,7 @@ def measure_change(m: ti.i32, followed: Followed, predicted: Vectors):
 
     The second number that is counted becomes 1 where it is beyond, and the third where it is not finite.
     """
-    nodes, patches, counter = ti.static((followed.nodes, followed.patches, followed.counters.found))
+    nodes, patches, counter = ti.static((followed.nodes, followed.patches, followed.met.found))
     (corners,) = ti.static((patches.corners,))
     squared = 0.0
     for place in range(corners.first[m], corners.first[m + 1]):
@@ -442,7 +431,7 @@ def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, follo
         least_gap = LEAST_GAP * thickness_between(v, tested.thickness)
         least = ti.min(ti.max((1.0 - LARGEST_SHARE) * apart, least_gap), apart - ROUNDING * size)
         if low - high < least:
-            ti.atomic_add(followed.counters.found[0], 1)
+            ti.atomic_add(followed.met.found[0], 1)
             tested.crossing[c] = 1
             pair = ti.math.vec4(0.0)
             between = 0.0
@@ -475,42 +464,42 @@ def end_contacts(
         vertex_count: number of vertices.
         predicted: displacements as contacts were looked for [m].
         is_changed: whether contacts displaced anything.
-        followed: the patches and their pairs; its counters get three numbers.
+        followed: the patches and their pairs; `found` gets three numbers.
         workers: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
 
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
     is not finite.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    nodes, patches, met, counters = ti.static((followed.nodes, followed.patches, followed.met, followed.counters))
+    nodes, patches, met = ti.static((followed.nodes, followed.patches, followed.met))
     contacts_end, vertices_end = count, vertex_count
     displaced_end, patches_end, pairs_end = workers[0], workers[1], workers[2]
-    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
+    met.found[0], met.found[1], met.found[2] = 0, 0, 0
     for c in range(contacts_end):
         repair_crossing(c, contacts, tested, followed)
-    begin_sharing(counters.taken, 0)
+    begin_sharing(met.taken, 0)
     for worker in range(displaced_end):
-        stop = ti.select(counters.found[0] == 0, patches.corners.count, 0)
-        m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+        stop = ti.select(met.found[0] == 0, patches.corners.count, 0)
+        m = next_item(-1, worker, met.taken, 0, PATCHES_AT_A_TIME)
         while m < stop:
             measure_change(m, followed, predicted)
-            m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+            m = next_item(m, worker, met.taken, 0, PATCHES_AT_A_TIME)
     for i in range(vertices_end):
-        if counters.found[0] + counters.found[1] + counters.found[2] == 0:
+        if met.found[0] + met.found[1] + met.found[2] == 0:
             nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
-    begin_sharing(counters.taken, 1)
+    begin_sharing(met.taken, 1)
     for worker in range(patches_end):
-        stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, patches.corners.count, 0)
-        m = next_item(-1, worker, counters.taken, 1, PATCHES_AT_A_TIME)
+        stop = ti.select(met.found[0] + met.found[1] + met.found[2] == 0, patches.corners.count, 0)
+        m = next_item(-1, worker, met.taken, 1, PATCHES_AT_A_TIME)
         while m < stop:
             finish_patch(m, is_changed, followed)
-            m = next_item(m, worker, counters.taken, 1, PATCHES_AT_A_TIME)
-    begin_sharing(counters.taken, 2)
+            m = next_item(m, worker, met.taken, 1, PATCHES_AT_A_TIME)
+    begin_sharing(met.taken, 2)
     for worker in range(pairs_end):
-        stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, met.count, 0)
-        p = next_item(-1, worker, counters.taken, 2, PAIRS_AT_A_TIME)
+        stop = ti.select(met.found[0] + met.found[1] + met.found[2] == 0, met.count, 0)
+        p = next_item(-1, worker, met.taken, 2, PAIRS_AT_A_TIME)
         while p < stop:
             if met.slack[p] > 0.0:
                 met.slack[p] -= met.approach[p] + patches.change[met.pairs[p][0]] + patches.change[met.pairs[p][1]]
-            p = next_item(p, worker, counters.taken, 2, PAIRS_AT_A_TIME)
-    return ti.math.ivec3(counters.found[0], counters.found[1], counters.found[2])
+            p = next_item(p, worker, met.taken, 2, PAIRS_AT_A_TIME)
+    return ti.math.ivec3(met.found[0], met.found[1], met.found[2])

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import (
     Boxes,
     BoxTree,
-    Counters,
     Followed,
     Four,
     KnownPairs,
@@ -187,7 +186,7 @@ class SelfCollision:
         self._nodes = TrackedNodes(state.position, state.displacement, ti.Vector.ndarray(3, ti.f32, n))
         self._rest, self._blocks = Rest(state.body, on_device(host.position)), blocks_of(self.patches)
         self._tree: BoxTree = with_room(BoxTree, 2 * self.patches.leaves, leaves=self.patches.leaves)
-        self._counters: Counters = with_room(Counters, 4)
+        self._taken, self._found = (ti.ndarray(ti.i32, 4) for _ in range(2))
         self._first_known, self._needed = ti.ndarray(ti.i32, 2 * max(m, 1)), ti.ndarray(ti.i32, max(m, 1))
         self._collides = ti.ndarray(ti.i32, len(state.names))
         self._maxima = LaneReduction(maxima=7, sums=0)
@@ -207,7 +206,8 @@ class SelfCollision:
 
     def _room_for_met(self, capacity: int) -> None:
         self._met_capacity = capacity
-        self.met: PatchPairArrays = with_room(PatchPairArrays, capacity, count=0, needed=self._needed)
+        kept = {"needed": self._needed, "taken": self._taken, "found": self._found}
+        self.met: PatchPairArrays = with_room(PatchPairArrays, capacity, count=0, **kept)
         self._spare = ti.ndarray(Two, capacity), ti.ndarray(ti.f32, capacity)
         self.carried, self._known = (ti.ndarray(ti.i32, capacity) for _ in range(2))
 
@@ -240,7 +240,7 @@ class SelfCollision:
 
     @property
     def _followed(self) -> Followed:
-        return Followed(self._nodes, self.moving, self.met, self._counters, self.thickness, self._astray)
+        return Followed(self._nodes, self.moving, self.met, self.thickness, self._astray)
 
     def look(self) -> None:
         """Note how cloth moves in this substep."""
@@ -302,7 +302,7 @@ class SelfCollision:
             merge_boxes(first, tree)
         before = self.met.pairs, self.met.slack
         known = KnownPairs(self._first_known, self._known, *before)
-        sort_known(int(self.met.count) if keeps else 0, patches.count, known, self._counters.found)
+        sort_known(int(self.met.count) if keeps else 0, patches.count, known, self._found)
         pairs, slack = self._spare
         self.met, self._spare = self.met._replace(pairs=pairs, slack=slack), before
         while True:
@@ -316,7 +316,6 @@ class SelfCollision:
                 self.met,
                 self.carried,
                 self._met_capacity,
-                self._counters,
             )
             if not 0 <= found <= MAX_PAIRS:
                 raise OverflowError(TOO_MANY)
@@ -361,7 +360,6 @@ class SelfCollision:
         find_near_pairs(
             (int(not self._is_searched), self.listed.capacity, workers_for(1)),
             PairSearch(
-                self._counters,
                 self.met,
                 self.moving.boxes,
                 self._blocks,
@@ -391,7 +389,7 @@ class SelfCollision:
         if not (self.meets or is_changed or self._was_changed):
             self.outcome = self._nothing
             return lambda: [0, 0, 0]
-        self.outcome, self._was_changed = self._counters.found, is_changed
+        self.outcome, self._was_changed = self._found, is_changed
         state, patches = self._state, workers_for(self.patches.count)
         return end_contacts.later(
             count if self.meets else 0,
