@@ -71,7 +71,7 @@ class ContinuousContacts:
         self._pairs = SelfCollision(state)
         self.rigid.set_spacing(self._pairs.coarsest_edge, self._pairs.longest_edge)
         n = state.vertex_count
-        self._contacts = ContactList(4 * n, drifts=self.rigid.bodies.on_device.deforms)
+        self._contacts = ContactList(4 * n, drifts=self.rigid.on_device.deforms)
         self._pushed: PushedNodes = with_room(
             PushedNodes,
             n,
@@ -130,7 +130,7 @@ class ContinuousContacts:
         state = self._state
         self._pairs.begin_frame()
         self.rigid.set_thickness(float(copied(state.thickness).min()), self._pairs.thickness)
-        self.rigid.bodies.begin_frame()
+        self.rigid.colliding.depth.fill(0.0)
         self._substeps = self._found = self._repaired = self._zone_vertices = self._left = 0
         self._velocities: Callable[[], Box] | None = None
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
@@ -154,13 +154,13 @@ class ContinuousContacts:
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
             "jammed": float(is_jammed.any()),
-            "bodies_show": float(copied(self.rigid.bodies.colliding.depth).max() > 1.0),
+            "bodies_show": float(copied(self.rigid.colliding.depth).max() > 1.0),
         }
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Linear and angular impulse on every body since the last call [N s], [N m s], (b, 3) each, for steps of dt."""
-        bodies = self.rigid.bodies
-        sums = self._impulse_unit * take(bodies.pushed.impulse).astype(np.float64).reshape(-1, 6)[: bodies.count]
+        impulses = take(self.rigid.pushed.impulse).astype(np.float64).reshape(-1, 6)
+        sums = self._impulse_unit * impulses[: self.rigid.count]
         return sums[:, :3] / dt, sums[:, 3:] / dt
 
     # --- the substep ------------------------------------------------------------------------------------------------
@@ -283,7 +283,7 @@ class ContinuousContacts:
     @property
     def _response(self) -> Response:
         impulses = self._contacts.impulses(self._impulse_unit)
-        return Response(self._contacts.found, impulses, self._pushed, self.rigid.bodies.pushed)
+        return Response(self._contacts.found, impulses, self._pushed, self.rigid.pushed)
 
     def _keep_apart(self, count: int) -> Sequence[int]:
         """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""

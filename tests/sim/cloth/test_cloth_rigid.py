@@ -20,7 +20,7 @@ from contact_scenes import SPACE, cloth_of, contacts_of, displace, distances_to_
 from device_distances import measure_distances
 
 from sim.cloth.continuous_contacts import ContinuousContacts
-from sim.cloth.rigid_contact import CollisionBodies, RigidContact
+from sim.cloth.rigid_contact import RigidContact
 from sim.core.motion.paths import Poses
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.body_geometry import BodyGeometry
@@ -42,7 +42,7 @@ def geometry(shape, **keys):
 def test_a_sphere_is_looked_at_within_its_radius_and_not_within_that_of_its_box():
     """Patches of cloth that are farther away are not looked at: with 3^(1/2) times the radius, many near a ball are."""
     box = geometry({"type": "box", "size": (0.2, 0.4, 0.4)})
-    radius = CollisionBodies([geometry(BALL, scale=1.5), box], [0.5, 0.5]).radius.to_numpy()
+    radius = RigidContact([geometry(BALL, scale=1.5), box], [0.5, 0.5], ()).radius.to_numpy()
     np.testing.assert_allclose(radius, [0.075, 0.3], rtol=1e-6)
 
 
@@ -61,7 +61,7 @@ def test_a_sphere_is_looked_at_within_its_radius_and_not_within_that_of_its_box(
 )
 def test_device_has_the_distances_of_the_solids(shape, tolerance):
     body = geometry(shape, scale=1.5)
-    bodies = CollisionBodies([body], [0.5])
+    bodies = RigidContact([body], [0.5], ())
     low, high = 1.3 * body.bounds
     points = np.random.default_rng(0).uniform(low, high, (2000, 3))
     points[0] = 0.0
