@@ -424,6 +424,7 @@ class PushedNodes(NamedTuple):
     held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)
     lever: Floats  # square root of the largest mobility of a body that presses [kg^(-1/2)], (n,)
     pressing_body: Integers  # its number, or -1, (n,)
+    between: Integers  # whether what stands and what presses touch it, `STANDS` and `PRESSED`, (n,)
 
 
 @bundle

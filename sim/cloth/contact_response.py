@@ -14,11 +14,11 @@ Sums over contacts are sums of integers, in units far below anything that matter
 and threads.
 
 A node under a heavy body on a floor passes on what neither its mass nor twenty steps could: D_c of it is ten thousand
-times too large for the body, which would fall through. So nodes between what stands and a body that moves have a
-`support` e: they answer to contacts by (1 - e²)/m, about as heavily as the body. What the answer keeps from them is the
-floor's, so that the momentum of cloth and bodies changes by what stands alone. Nodes that are pressed from both sides
-do not leave or enter either whatever their mass. But the cloth's own springs pull them from under the body more easily
-than its friction would let them.
+times too large for the body, which would fall through. So nodes between what stands and a body that moves, or between
+one of them and a node that the other touches, as in two layers, have a `support` e: they answer to contacts by
+(1 - e²)/m, about as heavily as the body. What the answer keeps from them is the floor's, so that the momentum of cloth
+and bodies changes by what stands alone. Nodes that are pressed from both sides do not leave or enter either whatever
+their mass. But the cloth's own springs pull them from under the body more easily than its friction would let them.
 """
 
 import taichi as ti
@@ -121,6 +121,8 @@ heavy node that meets the edge of a body obliquely would kick it."""
 LEAST_COSINE = 0.86
 """Contacts are turned to the support of their vertices if the cosine of the angle between both lines is larger."""
 
+STANDS, PRESSED = 1, 2  # bits of `PushedNodes.between`
+
 LEAST_ANSWER = 1.0e-6  # of a vertex that has a support: float32 cannot tell less from none
 
 
@@ -134,9 +136,35 @@ def hold(c: ti.i32, contacts: Contacts, most: ti.f32, nodes: PushedNodes):
             part = (ti.abs(contacts.weights[c][k]) * SHARES_PER_UNIT) * contacts.normal[c]
             for axis in ti.static(range(3)):
                 ti.atomic_add(nodes.held_sums[6 * v + side + axis], ti.round(part[axis], ti.i32))
+            ti.atomic_or(nodes.between[v], ti.select(most > 0.0, PRESSED, STANDS))
             if most > 0.0:
                 ti.atomic_max(nodes.lever[v], ti.sqrt(most))
                 ti.atomic_max(nodes.pressing_body[v], contacts.kind[c])
+
+
+@func
+def pass_on(c: ti.i32, contacts: Contacts, nodes: PushedNodes):
+    """Let each side of a contact of cloth with cloth be held, and pressed, as the other is, where nothing else does."""
+    for sign in ti.static((1.0, -1.0)):
+        known, lever, body = 0, 0.0, -1
+        for k in ti.static(range(4)):
+            v = contacts.vertices[c][k]
+            if sign * contacts.weights[c][k] < 0.0:
+                known |= nodes.between[v]
+                if nodes.between[v] & PRESSED != 0:
+                    lever, body = ti.max(lever, nodes.lever[v]), ti.max(body, nodes.pressing_body[v])
+        for k in ti.static(range(4)):
+            v = contacts.vertices[c][k]
+            if sign * contacts.weights[c][k] > 0.0:
+                part, more = (contacts.weights[c][k] * SHARES_PER_UNIT) * contacts.normal[c], known & ~nodes.between[v]
+                for axis in ti.static(range(3)):
+                    if more & STANDS != 0:
+                        ti.atomic_add(nodes.held_sums[6 * v + axis], ti.round(part[axis], ti.i32))
+                    if more & PRESSED != 0:
+                        ti.atomic_add(nodes.held_sums[6 * v + 3 + axis], ti.round(part[axis], ti.i32))
+                if more & PRESSED != 0:
+                    ti.atomic_max(nodes.lever[v], lever)
+                    ti.atomic_max(nodes.pressing_body[v], body)
 
 
 @func
@@ -213,7 +241,7 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, vertices_end = contacts.counter[2], vertex_count
-    all_end = ti.max(vertex_count, bodies.count)
+    braced_end, all_end = bodies.may_move * contacts_end, ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
         nodes.counter[k] = 0
     for i in range(all_end):
@@ -222,7 +250,7 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
             if is_first == 1:
                 nodes.predicted[i] = nodes.displacement[i]
             if bodies.may_move == 1:
-                nodes.lever[i], nodes.pressing_body[i] = 0.0, -1
+                nodes.lever[i], nodes.pressing_body[i], nodes.between[i] = 0.0, -1, 0
                 for k in ti.static(range(6)):
                     nodes.held_sums[6 * i + k] = 0
         if i < bodies.count:
@@ -248,6 +276,9 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
                 hold(c, contacts, most, nodes)
             if free >= LEAST_FREE_WEIGHT:
                 impulses.mobility[c] = 1.0
+    for c in range(braced_end):
+        if contacts.floor[c] > 0.5 * INACTIVE and WALL < contacts.kind[c] < 0:
+            pass_on(c, contacts, nodes)
     for i in range(vertices_end):
         if nodes.uses[2 * i] == 1 and nodes.uses[2 * i + 1] == 1:
             nodes.uses[2 * i] = ALONE

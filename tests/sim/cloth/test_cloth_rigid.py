@@ -127,6 +127,26 @@ def test_what_one_body_pushes_another_holds():
     assert moved[:, 2].min() > -0.15 * thickness  # 0.1 of it was free
 
 
+def test_two_layers_carry_a_heavy_body_and_do_not_enter_it_or_the_floor():
+    """A box of 50 kg comes down on them: the upper layer touches no floor, and the lower one no box."""
+    thickness = 0.5e-3
+    layers = [
+        {"shape": rectangle((0.2, 0.2), (10, 10)), "position": (1e-3 * k, 7e-4 * k, thickness * (k + 0.6))}
+        for k in range(2)
+    ]
+    box = {"kind": "dynamic", "density": 5e4, "shape": {"type": "box", "size": (0.1, 0.1, 0.1)}}
+    world = world_of(*layers, bodies=[{**box, "position": (0.0, 0.0, 0.0563)}])
+    deepest, lowest = 0.0, 0.0
+    for _ in range(15):
+        told = world.advance_frame().diagnostics["cloth"]["bodies_show"]
+        assert told == 0
+        deepest = min(deepest, distances_to_body(world, 0).min())
+        lowest = min(lowest, cloth_of(world).state.positions()[:, 2].min())
+    assert deepest > -0.1 * thickness
+    assert lowest > -0.1 * thickness
+    assert rigid_of(world).bodies.position[0, 2] - 0.05 < 3.0 * thickness, "it was thrown"
+
+
 def test_a_body_that_several_layers_do_not_carry_is_told_and_a_pin_in_a_post_is_not():
     """50 kg on five layers of nodes of 0.2 g; and an edge that is pinned in the middle of a bar."""
     layers = [{"shape": rectangle((0.2, 0.2), (6, 6)), "position": (0.0, 0.0, 0.5e-3 * (k + 1))} for k in range(5)]
