@@ -150,7 +150,7 @@ def listed_pairs(solver: ClothSolver) -> int:
     if solver.contacts is None:
         return 0
     pairs = solver.contacts._pairs
-    return int(copied(pairs.listed.on_device.pieces)[: 2 * pairs.patch_pairs.count, 2].sum())
+    return int(copied(pairs.listed.on_device.pieces)[: 2 * pairs.met.count, 2].sum())
 
 
 def seconds_of_contacts(world: World, solver: ClothSolver) -> float:

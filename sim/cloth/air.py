@@ -64,21 +64,19 @@ class ClothAir:
             raise KeyRefusedError(*conflict)
         host = self._state.host
         drag = [
-            [0.5 * cloth.air_density * cloth.drag for cloth in cloths],
-            [0.5 * cloth.air_density * cloth.skin_drag for cloth in cloths],
-            [cloth.mass_per_area for cloth in cloths],
+            (0.5 * cloth.air_density * cloth.drag, 0.5 * cloth.air_density * cloth.skin_drag, cloth.mass_per_area)
+            for cloth in cloths
         ]
-        of_triangles = np.stack([host.of_triangles(each) for each in drag], axis=1)
+        of_triangles = host.of_triangles(drag)
         of_triangles[:, 2] *= triangle_areas(host.position, host.triangles)
         self._drag.from_numpy(of_triangles.astype(np.float32))
         density = [cloth.air_density if cloth.drag + cloth.skin_drag > 0.0 else 0.0 for cloth in cloths]
         self.density.from_numpy(host.of_triangles(density).astype(np.float32))
-        wind = [host.of_triangles([cloth.wind[axis] for cloth in cloths]) for axis in range(3)]
-        wind_of = np.stack(wind, axis=1).astype(np.float32)
+        wind_of = host.of_triangles([cloth.wind for cloth in cloths]).astype(np.float32)
         self.wind.from_numpy(wind_of)
         is_wind = self.source.to_numpy() == WIND
         self.velocity.from_numpy(np.where(is_wind[:, None], wind_of, self.velocity.to_numpy()))
-        self.acts = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
+        self.acts = any(density)
 
     def blow(self, forces: ForcesOn) -> None:
         """Let winds move the air that no coupling puts there, on top of the wind of the parameters."""

@@ -59,32 +59,23 @@ class Rest(NamedTuple):
 
 @bundle
 class SpringArrays(NamedTuple):
-    """Springs of one family, s of them; a piece is one spring where they are solved one by one."""
+    """Springs of one family; a piece is one spring where they are solved one by one."""
 
+    count: ti.i32  # s
     nodes: Integers  # (arity s,)
     law: Laws  # rest length [m], stiffness [N/m], damping over stiffness [s], (s,)
     coefficients: Floats  # of springs with four nodes, (4 s,)
     shift: Floats  # what springs of threads count as longer, because of the strain across [m], (s,)
     segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
-    piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
-
-
-@bundle
-class CellArrays(NamedTuple):
-    """Cells with as many nodes each, s of them."""
-
-    nodes: Integers  # (arity s,)
-    along: Floats  # c_a of d_u [1/m], (arity s,)
-    across: Floats  # c_a of d_v [1/m], (arity s,)
-    law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
-    cell_of_colour: Integers  # first cell of each colour, and number of cells, (colours + 1,)
-    multiplier: Floats  # of the shear, (s,); rectangles only
 
 
 @bundle
 class MeshNodes(NamedTuple):
-    """Nodes of s triangles, o of them, piece by piece, in chunks of about as many nodes as there are chunks."""
+    """Nodes of s triangles, piece by piece, in chunks of about as many nodes as there are chunks."""
 
+    count: ti.i32  # o
+    chunks: ti.i32
+    pieces: ti.i32
     node: Integers  # number, (o,)
     start: Integers  # of each node in `corner`, (o + 1,)
     corner: Integers  # corner a of triangle s is 3 s + a
@@ -95,6 +86,19 @@ class MeshNodes(NamedTuple):
     piece: Integers  # (o,)
     chunk: Integers  # first node of each chunk, and o
     first_chunk: Integers  # of each piece, and number of chunks
+
+
+@bundle
+class CellArrays(NamedTuple):
+    """Cells with as many nodes each."""
+
+    count: ti.i32  # s
+    nodes: Integers  # (arity s,)
+    along: Floats  # c_a of d_u [1/m], (arity s,)
+    across: Floats  # c_a of d_v [1/m], (arity s,)
+    law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
+    multiplier: Floats  # of the shear, (s,); rectangles only
+    mesh: MeshNodes  # those of triangles; none of rectangles
 
 
 @bundle
@@ -133,12 +137,7 @@ class TriangleWork(NamedTuple):
 class TriangleSystem(NamedTuple):
     """What triangles are solved by together."""
 
-    count: ti.i32  # s
-    own: ti.i32  # o
-    chunks: ti.i32
-    pieces: ti.i32
     cells: CellArrays
-    mesh: MeshNodes
     frames: TriangleFrames
     work: TriangleWork
 
@@ -232,18 +231,13 @@ class Boxes(NamedTuple):
 
 
 @bundle
-class PatchBounds(NamedTuple):
-    """Boxes of the patches at the start of the substep, and their motion in it."""
+class MovingPatches(NamedTuple):
+    """Patches as their motion is followed: where they are, and distances that they move and that lists allow for [m],
+    (m,) each."""
 
-    low: Vectors  # [m], (m,)
-    high: Vectors
+    corners: PatchNodes  # all nodes of their triangles
+    boxes: Boxes
     motion: PatchMotion
-
-
-@bundle
-class PatchBudget(NamedTuple):
-    """Distances that patches move, and that lists allow for [m], (m,) each."""
-
     moves: Floats  # largest distance of a vertex from the middle of all displacements
     change: Floats  # largest displacement by contacts
     margin: Floats  # how far contacts may displace
@@ -251,25 +245,6 @@ class PatchBudget(NamedTuple):
     spent: Floats  # sum over the substeps since the patches were paired
     travel: Floats  # `spent`, with this substep and `more`
     reach: Floats  # which `travel` may have until they are paired anew
-
-
-@bundle
-class MovingPatches(NamedTuple):
-    """Patches as their motion is followed."""
-
-    corners: PatchNodes  # all nodes of their triangles
-    bounds: PatchBounds
-    budget: PatchBudget
-
-
-@bundle
-class SubstepEnd(NamedTuple):
-    """Limits by which patches finish a substep."""
-
-    is_changed: ti.i32  # whether contacts displaced anything
-    astray: ti.f32  # largest distance of a vertex from where it was expected [m]
-    least_margin: ti.f32  # [m]
-    half_thickness: ti.f32  # [m]
 
 
 @bundle
@@ -306,23 +281,19 @@ class PatchPairArrays(NamedTuple):
     due: Integers  # numbers of the pairs of which elements have to be looked at
     expired: Integers  # numbers of those that have to be searched
     needed: Integers  # 1 for their patches, (m,)
-
-
-@bundle
-class Ageing(NamedTuple):
-    """What decides whether the list of a pair of patches is searched anew, or looked at."""
-
-    thickness: ti.f32  # the largest [m]
-    least_skin: ti.f32  # how far beyond to search at least [m]
-    first_due: Floats  # `PairPieces.piece_due`, (2 p,)
-
-
-@bundle
-class Counters(NamedTuple):
-    """What threads count together."""
-
     taken: Integers  # items of each loop; see `sim.core.scheduling`
-    found: Integers
+    found: Integers  # what threads count together
+
+
+@bundle
+class Followed(NamedTuple):
+    """Patches and their pairs from substep to substep."""
+
+    nodes: TrackedNodes
+    patches: MovingPatches
+    met: PatchPairArrays
+    thickness: ti.f32  # the largest [m]
+    astray: ti.f32  # largest distance of a vertex from where the substep before should have led it [m]
 
 
 # --- pairs of elements ----------------------------------------------------------------------------------------------
@@ -398,6 +369,20 @@ class Contacts(NamedTuple):
 
 
 @bundle
+class PairSearch(NamedTuple):
+    """What pairs of elements are listed and looked at with."""
+
+    met: PatchPairArrays
+    boxes: Boxes
+    blocks: PatchBlocks
+    listed: PairPieces
+    surface: Surface
+    rest: Rest
+    recovery: ti.f32  # share of a missing distance that the substep gives back [-]
+    contacts: Contacts  # which pairs that meet are appended to
+
+
+@bundle
 class TestedContacts(NamedTuple):
     """What the test of contacts for crossings reads and writes besides; see `repair_crossing`."""
 
@@ -424,7 +409,7 @@ class Impulses(NamedTuple):
 
 @bundle
 class PushedNodes(NamedTuple):
-    """Nodes as contacts push them."""
+    """Nodes as contacts push them, and what is found of each as contacts are weighed."""
 
     displacement: Vectors  # [m], (n,)
     inverse_mass: Floats  # [1/kg], (n,)
@@ -433,18 +418,13 @@ class PushedNodes(NamedTuple):
     touched: Integers  # numbers of those that contacts push
     uses: Integers  # first and last place of each node in `Impulses.used_by`, (2 n,)
     support: Vectors  # see `contact_response`, (n,)
-
-
-@bundle
-class NodeSums(NamedTuple):
-    """Numbers of each node that are found as contacts are weighed."""
-
     counter: Integers  # contacts that push, their nodes, and uses; whether any misses much, is settled, (5,)
     predicted: Vectors  # displacement as contacts were looked for [m], (n,)
     shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
     held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)
     lever: Floats  # square root of the largest mobility of a body that presses [kg^(-1/2)], (n,)
     pressing_body: Integers  # its number, or -1, (n,)
+    between: Integers  # whether what stands and what presses touch it, `STANDS` and `PRESSED`, (n,)
 
 
 @bundle
@@ -471,7 +451,6 @@ class Response(NamedTuple):
     contacts: Contacts
     impulses: Impulses
     nodes: PushedNodes
-    sums: NodeSums
     bodies: PushedBodies
 
 

@@ -14,16 +14,16 @@ Sums over contacts are sums of integers, in units far below anything that matter
 and threads.
 
 A node under a heavy body on a floor passes on what neither its mass nor twenty steps could: D_c of it is ten thousand
-times too large for the body, which would fall through. So nodes between what stands and a body that moves have a
-`support` e: they answer to contacts by (1 - e²)/m, about as heavily as the body. What the answer keeps from them is the
-floor's, so that the momentum of cloth and bodies changes by what stands alone. Nodes that are pressed from both sides
-do not leave or enter either whatever their mass. But the cloth's own springs pull them from under the body more easily
-than its friction would let them.
+times too large for the body, which would fall through. So nodes between what stands and a body that moves, or between
+one of them and a node that the other touches, as in two layers, have a `support` e: they answer to contacts by
+(1 - e²)/m, about as heavily as the body. What the answer keeps from them is the floor's, so that the momentum of cloth
+and bodies changes by what stands alone. Nodes that are pressed from both sides do not leave or enter either whatever
+their mass. But the cloth's own springs pull them from under the body more easily than its friction would let them.
 """
 
 import taichi as ti
 
-from sim.cloth.bundles import Contacts, Impulses, NodeSums, PushedBodies, Response
+from sim.cloth.bundles import Contacts, Impulses, PushedBodies, PushedNodes, Response
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import INACTIVE, WALL
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
@@ -78,12 +78,6 @@ def body_mobility(c: ti.i32, contacts: Contacts, bodies: PushedBodies) -> ti.f32
 
 
 @ti.func
-def give_body(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers):
-    """Add the opposite of an impulse, in units, to what a body gets, to the nearest unit."""
-    give(opposite_of(push, arm), body, body_gathered)
-
-
-@ti.func
 def opposite_of(push: ti.math.vec3, arm: ti.math.vec3) -> Given:
     """The opposite of an impulse, in units, and of its moment, to the nearest unit."""
     twist = arm.cross(push)
@@ -102,17 +96,14 @@ def give(given: Given, body: ti.i32, body_gathered: LongIntegers):
 
 
 @ti.func
-def give_body_together(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers, item: ti.i32):
-    """The same where all threads of a warp call it, for body -1 where there is none: one addition for most of them."""
+def give_together(given: Given, body: ti.i32, body_gathered: LongIntegers, item: ti.i32):
+    """The same where all threads of a warp call it: one addition for most of them."""
     common = largest_in_warp(body)
-    if body >= 0 and body != common:
-        give_body(push, body, arm, body_gathered)
+    if body != common:
+        give(given, body, body_gathered)
     if common >= 0:
-        own = ti.cast(body == common, ti.f32)
-        p, twist = own * push, own * arm.cross(push)
-        for axis in ti.static(range(3)):
-            add_to(body_gathered, 6 * common + axis, -ti.round(p[axis], ti.i64), item)
-            add_to(body_gathered, 6 * common + 3 + axis, -ti.round(twist[axis], ti.i64), item)
+        for axis in ti.static(range(6)):
+            add_to(body_gathered, 6 * common + axis, ti.select(body == common, given[axis], ti.cast(0, ti.i64)), item)
 
 
 @ti.func
@@ -130,11 +121,13 @@ heavy node that meets the edge of a body obliquely would kick it."""
 LEAST_COSINE = 0.86
 """Contacts are turned to the support of their vertices if the cosine of the angle between both lines is larger."""
 
+STANDS, PRESSED = 1, 2  # bits of `PushedNodes.between`
+
 LEAST_ANSWER = 1.0e-6  # of a vertex that has a support: float32 cannot tell less from none
 
 
 @func
-def hold(c: ti.i32, contacts: Contacts, most: ti.f32, sums: NodeSums):
+def hold(c: ti.i32, contacts: Contacts, most: ti.f32, nodes: PushedNodes):
     """Sum up which way the vertices of a contact are held by what stands, and pressed by a body that moves."""
     side = ti.select(most > 0.0, 3, 0)
     for k in ti.static(range(4)):
@@ -142,10 +135,36 @@ def hold(c: ti.i32, contacts: Contacts, most: ti.f32, sums: NodeSums):
             v = contacts.vertices[c][k]
             part = (ti.abs(contacts.weights[c][k]) * SHARES_PER_UNIT) * contacts.normal[c]
             for axis in ti.static(range(3)):
-                ti.atomic_add(sums.held_sums[6 * v + side + axis], ti.round(part[axis], ti.i32))
+                ti.atomic_add(nodes.held_sums[6 * v + side + axis], ti.round(part[axis], ti.i32))
+            ti.atomic_or(nodes.between[v], ti.select(most > 0.0, PRESSED, STANDS))
             if most > 0.0:
-                ti.atomic_max(sums.lever[v], ti.sqrt(most))
-                ti.atomic_max(sums.pressing_body[v], contacts.kind[c])
+                ti.atomic_max(nodes.lever[v], ti.sqrt(most))
+                ti.atomic_max(nodes.pressing_body[v], contacts.kind[c])
+
+
+@func
+def pass_on(c: ti.i32, contacts: Contacts, nodes: PushedNodes):
+    """Let each side of a contact of cloth with cloth be held, and pressed, as the other is, where nothing else does."""
+    for sign in ti.static((1.0, -1.0)):
+        known, lever, body = 0, 0.0, -1
+        for k in ti.static(range(4)):
+            v = contacts.vertices[c][k]
+            if sign * contacts.weights[c][k] < 0.0:
+                known |= nodes.between[v]
+                if nodes.between[v] & PRESSED != 0:
+                    lever, body = ti.max(lever, nodes.lever[v]), ti.max(body, nodes.pressing_body[v])
+        for k in ti.static(range(4)):
+            v = contacts.vertices[c][k]
+            if sign * contacts.weights[c][k] > 0.0:
+                part, more = (contacts.weights[c][k] * SHARES_PER_UNIT) * contacts.normal[c], known & ~nodes.between[v]
+                for axis in ti.static(range(3)):
+                    if more & STANDS != 0:
+                        ti.atomic_add(nodes.held_sums[6 * v + axis], ti.round(part[axis], ti.i32))
+                    if more & PRESSED != 0:
+                        ti.atomic_add(nodes.held_sums[6 * v + 3 + axis], ti.round(part[axis], ti.i32))
+                if more & PRESSED != 0:
+                    ti.atomic_max(nodes.lever[v], lever)
+                    ti.atomic_max(nodes.pressing_body[v], body)
 
 
 @func
@@ -219,21 +238,21 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     If bodies may move, each vertex between what stands and a body that moves gets its `support`, and its contacts a
     normal along that, from `held_sums`, `lever` and `pressing_body`.
     """
-    contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
+    contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, vertices_end = contacts.counter[2], vertex_count
-    all_end = ti.max(vertex_count, bodies.count)
+    braced_end, all_end = bodies.may_move * contacts_end, ti.max(vertex_count, bodies.count)
     for k in ti.static(range(5)):
-        sums.counter[k] = 0
+        nodes.counter[k] = 0
     for i in range(all_end):
         if i < vertex_count:
-            sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
+            nodes.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
             if is_first == 1:
-                sums.predicted[i] = nodes.displacement[i]
+                nodes.predicted[i] = nodes.displacement[i]
             if bodies.may_move == 1:
-                sums.lever[i], sums.pressing_body[i] = 0.0, -1
+                nodes.lever[i], nodes.pressing_body[i], nodes.between[i] = 0.0, -1, 0
                 for k in ti.static(range(6)):
-                    sums.held_sums[6 * i + k] = 0
+                    nodes.held_sums[6 * i + k] = 0
         if i < bodies.count:
             bodies.load[i] = ti.cast(0, ti.i64)
     for c in range(contacts_end):
@@ -243,7 +262,7 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
             for k in ti.static(range(4)):
                 if contacts.weights[c][k] != 0.0:
                     share = ti.cast(ti.ceil(ti.abs(contacts.weights[c][k]) * SHARES_PER_UNIT), ti.i32)
-                    ti.atomic_add(sums.shares[contacts.vertices[c][k]], share)
+                    ti.atomic_add(nodes.shares[contacts.vertices[c][k]], share)
                     ti.atomic_add(nodes.uses[2 * contacts.vertices[c][k] + 1], 1)
                     if nodes.inverse_mass[contacts.vertices[c][k]] > 0.0:
                         free += ti.abs(contacts.weights[c][k])
@@ -254,33 +273,36 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
             if is_of_vertex_and_what_stands(c, contacts, bodies):
                 ti.atomic_add(nodes.uses[2 * contacts.vertices[c][0]], 1)
             if bodies.may_move == 1 and (b >= 0 or b == WALL):
-                hold(c, contacts, most, sums)
+                hold(c, contacts, most, nodes)
             if free >= LEAST_FREE_WEIGHT:
                 impulses.mobility[c] = 1.0
+    for c in range(braced_end):
+        if contacts.floor[c] > 0.5 * INACTIVE and WALL < contacts.kind[c] < 0:
+            pass_on(c, contacts, nodes)
     for i in range(vertices_end):
         if nodes.uses[2 * i] == 1 and nodes.uses[2 * i + 1] == 1:
             nodes.uses[2 * i] = ALONE
-        elif sums.shares[i] > 0:
-            nodes.touched[ti.atomic_add(sums.counter[1], 1)] = i
-            first = ti.atomic_add(sums.counter[2], nodes.uses[2 * i + 1])
+        elif nodes.shares[i] > 0:
+            nodes.touched[ti.atomic_add(nodes.counter[1], 1)] = i
+            first = ti.atomic_add(nodes.counter[2], nodes.uses[2 * i + 1])
             nodes.uses[2 * i], nodes.uses[2 * i + 1] = first, first
         if bodies.may_move == 1:
-            b = sums.pressing_body[i]
+            b = nodes.pressing_body[i]
             nodes.support[i] = ti.math.vec3(0.0)
             if b >= 0 and nodes.inverse_mass[i] > 0.0:
-                of_body = sums.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
-                own = nodes.inverse_mass[i] * ti.cast(sums.shares[i], ti.f32) / SHARES_PER_UNIT
-                nodes.support[i] = support_between(i, sums.held_sums, of_body / own)
+                of_body = nodes.lever[i] * ti.cast(bodies.load[b], ti.f32) * bodies.load_unit
+                own = nodes.inverse_mass[i] * ti.cast(nodes.shares[i], ti.f32) / SHARES_PER_UNIT
+                nodes.support[i] = support_between(i, nodes.held_sums, of_body / own)
     for c in range(contacts_end):
         if impulses.mobility[c] > 0.0:
             if is_first == 1:
                 impulses.impulse[c] = ti.math.vec3(0.0)
             if is_settled(c, r):
                 impulses.mobility[c] = nodes.inverse_mass[contacts.vertices[c][0]]
-                if sums.counter[4] == 0:
-                    sums.counter[4] = 1
+                if nodes.counter[4] == 0:
+                    nodes.counter[4] = 1
             else:
-                place = ti.atomic_add(sums.counter[0], 1)
+                place = ti.atomic_add(nodes.counter[0], 1)
                 impulses.pushing[place] = c
                 impulses.mobility[c] = weighed(c, place, r)
 
@@ -288,7 +310,7 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
 @func
 def weighed(c: ti.i32, place: ti.i32, r: Response) -> ti.f32:
     """The diagonal D of a contact, which gets its place among the uses of its vertices, and its normal."""
-    contacts, impulses, nodes, sums, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.sums, r.bodies))
+    contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
     if bodies.may_move == 1 and (contacts.kind[c] >= 0 or contacts.kind[c] == WALL):
         contacts.normal[c] = turned_to_support(c, contacts, nodes.support)
     total = 0.0
@@ -296,7 +318,7 @@ def weighed(c: ti.i32, place: ti.i32, r: Response) -> ti.f32:
         weight = ti.abs(contacts.weights[c][k])
         if weight > 0.0:
             v = contacts.vertices[c][k]
-            own = weight * nodes.inverse_mass[v] * (ti.cast(sums.shares[v], ti.f32) / SHARES_PER_UNIT)
+            own = weight * nodes.inverse_mass[v] * (ti.cast(nodes.shares[v], ti.f32) / SHARES_PER_UNIT)
             total += answer_of(nodes.support[v]) * own
             use = ti.atomic_add(nodes.uses[2 * v + 1], 1)
             impulses.used_by[use], impulses.use_weight[use] = place, contacts.weights[c][k]
@@ -331,16 +353,19 @@ def settle_all(count: ti.i32, whole_end: ti.i32, r: Response):
             continue
         given_body, given = -1, Given(0)
         for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
-            push, body, arm = ti.math.vec3(0.0), -1, ti.math.vec3(0.0)
+            body, more = -1, Given(0)
             if c < count and impulses.mobility[c] > 0.0 and is_settled(c, r):
-                push, body, arm = settle(c, r), contacts.kind[c], contacts.arm[c]
+                push = settle(c, r)
+                body = contacts.kind[c]
+                if body >= 0:
+                    more = opposite_of(push, contacts.arm[c])
             if ti.static(runs_on_gpu()):
-                give_body_together(push, body, arm, bodies.impulse, c)
+                give_together(more, body, bodies.impulse, c)
             elif body >= 0:
                 if body != given_body:
                     give(given, given_body, bodies.impulse)
                     given_body, given = body, Given(0)
-                given += opposite_of(push, arm)
+                given += more
         give(given, given_body, bodies.impulse)
 
 
@@ -407,7 +432,7 @@ def push_contact(place: ti.i32, momentum: ti.f32, r: Response):
     impulses.push[place] = (after - ahead) / impulses.unit
     # What nothing moves need not hear of it before the end: its sums are in the way of all threads.
     if (after - ahead).norm_sqr() > 0.0 and body_mobility(c, contacts, bodies) > 0.0:
-        give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
+        give(opposite_of(impulses.push[place], contacts.arm[c]), contacts.kind[c], bodies.gathered)
 
 
 @func
@@ -464,7 +489,7 @@ def finish_push(count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Resp
         c = impulses.pushing[place]
         impulses.push[place] = (impulses.impulse[c] - impulses.impulse_given[c]) / impulses.unit
         if contacts.kind[c] >= 0:
-            give_body(impulses.push[place], contacts.kind[c], contacts.arm[c], bodies.gathered)
+            give(opposite_of(impulses.push[place], contacts.arm[c]), contacts.kind[c], bodies.gathered)
     for place in range(moved_end):
         if place < touched_count:
             i = nodes.touched[place]
@@ -493,22 +518,22 @@ TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they
 @large_kernel
 def push(
     momenta: Momenta, starts: ti.i32, settles: ti.i32, finishes: ti.i32, r: Response, thickness: Floats
-) -> ti.math.ivec4:
+) -> ti.math.ivec3:
     """Some steps of the iteration of a round of contacts that were weighed (`weigh_contacts`), and where they lead if
     it `finishes`; first those that one step solves, if it `settles` them.
 
-    Returns how many contacts push on, how many vertices they push, whether any is below its floor by more than
-    `TOLERANCE` then, and whether any are settled.
+    Returns how many contacts push on, whether any is below its floor by more than `TOLERANCE` then, and whether any are
+    settled.
     """
-    contacts, sums = ti.static((r.contacts, r.sums))
+    contacts, nodes = ti.static((r.contacts, r.nodes))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    pushing_count, touched_count = sums.counter[0], sums.counter[1]
+    pushing_count, touched_count = nodes.counter[0], nodes.counter[1]
     moved_end = touched_count + r.bodies.count
     new_end = starts * ti.max(pushing_count, moved_end)
     finished_end, finished_moved_end = finishes * pushing_count, finishes * moved_end
-    settled_end = settles * sums.counter[4] * contacts.counter[2]
+    settled_end = settles * nodes.counter[4] * contacts.counter[2]
     whole_end = whole_warps(settled_end)
-    sums.counter[3] = 0
+    nodes.counter[3] = 0
     settle_all(settled_end, whole_end, r)
     push_apart(momenta, new_end, pushing_count, touched_count, moved_end, r)
     finish_push(finished_end, touched_count, finished_moved_end, r)
@@ -517,5 +542,5 @@ def push(
         w = relative_displacement(c, r)
         missing = contacts.floor[c] - w.dot(contacts.normal[c])
         if missing / thickness_between(contacts.vertices[c], thickness) > TOLERANCE:
-            sums.counter[3] = 1
-    return ti.math.ivec4(pushing_count, touched_count, sums.counter[3], sums.counter[4])
+            nodes.counter[3] = 1
+    return ti.math.ivec3(pushing_count, nodes.counter[3], nodes.counter[4])

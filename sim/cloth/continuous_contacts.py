@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sim.cloth.bundles import NodeSums, PushedNodes, Response
+from sim.cloth.bundles import PushedNodes, Response
 from sim.cloth.contact_response import STEPS, push, weigh_contacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
@@ -69,19 +69,17 @@ class ContinuousContacts:
     def __init__(self, state: ClothState, *, rigid: RigidContact | None = None) -> None:
         self.rigid = rigid or RigidContact((), (), ())
         self._pairs = SelfCollision(state)
-        self._patches = self._pairs.patches
         self.rigid.set_spacing(self._pairs.coarsest_edge, self._pairs.longest_edge)
         n = state.vertex_count
-        self._contacts = ContactList(4 * n, drifts=self.rigid.bodies.on_device.deforms)
+        self._contacts = ContactList(4 * n, drifts=self.rigid.on_device.deforms)
         self._pushed: PushedNodes = with_room(
             PushedNodes,
             n,
             displacement=state.displacement,
             inverse_mass=state.inverse_mass,
             uses=ti.ndarray(ti.i32, 2 * n),
-        )
-        self._sums: NodeSums = with_room(
-            NodeSums, n, counter=ti.ndarray(ti.i32, 5), held_sums=ti.ndarray(ti.i32, 6 * n)
+            counter=ti.ndarray(ti.i32, 5),
+            held_sums=ti.ndarray(ti.i32, 6 * n),
         )
         self._ends = LaneReduction(maxima=6, sums=0)
         self._state = state
@@ -92,8 +90,9 @@ class ContinuousContacts:
 
     # --- what the solver asks ---------------------------------------------------------------------------------------
 
-    def stable_dt(self, state: ClothState, at_most: float) -> float:
+    def stable_dt(self, at_most: float) -> float:
         """Largest step [s] in which cloth moves little against itself, and against bodies that it may meet."""
+        state = self._state
         n, first = state.vertex_count, state.host.first_node
         asked, self._velocities = self._velocities or box_of(state.velocity, 0, n, self._ends), None
         velocity = asked()
@@ -129,16 +128,16 @@ class ContinuousContacts:
     def begin_frame(self) -> None:
         """Count anew, and expect of contacts what a run does that continues here."""
         state = self._state
-        self._pairs.begin_frame(state)
+        self._pairs.begin_frame()
         self.rigid.set_thickness(float(copied(state.thickness).min()), self._pairs.thickness)
-        self.rigid.bodies.begin_frame()
-        self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
+        self.rigid.colliding.depth.fill(0.0)
+        self._substeps = self._found = self._repaired = self._zone_vertices = self._left = 0
         self._velocities: Callable[[], Box] | None = None
         self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())
 
     def diagnostics(self) -> Mapping[str, float]:
-        """Numbers of the frame: contacts, with watched pairs, and iterations a substep.
+        """Numbers of the frame: contacts a substep, with watched pairs.
 
         `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
         that had to move with others, `crossings_left` pairs that even so may have crossed, as where pins are led
@@ -151,63 +150,57 @@ class ContinuousContacts:
         is_jammed = self._moved_as_one > JAMMED_SHARE * max(self._substeps, 1) * nodes
         return {
             "contacts": self._found / max(self._substeps, 1),
-            "contact_iterations": self._iterations / max(self._substeps, 1),
             "repaired_crossings": float(self._repaired),
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
             "jammed": float(is_jammed.any()),
-            "bodies_show": float(copied(self.rigid.bodies.colliding.depth).max() > 1.0),
+            "bodies_show": float(copied(self.rigid.colliding.depth).max() > 1.0),
         }
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Linear and angular impulse on every body since the last call [N s], [N m s], (b, 3) each, for steps of dt."""
-        bodies = self.rigid.bodies
-        sums = self._impulse_unit * take(bodies.pushed.impulse).astype(np.float64).reshape(-1, 6)[: bodies.count]
+        impulses = take(self.rigid.pushed.impulse).astype(np.float64).reshape(-1, 6)
+        sums = self._impulse_unit * impulses[: self.rigid.count]
         return sums[:, :3] / dt, sums[:, 3:] / dt
 
     # --- the substep ------------------------------------------------------------------------------------------------
 
     def resolve(
-        self,
-        state: ClothState,
-        dt: float,
-        turns: Turns | None = None,
-        conclude: Callable[[ti.Ndarray], None] | None = None,
+        self, dt: float, turns: Turns | None = None, conclude: Callable[[ti.Ndarray], None] | None = None
     ) -> bool:
         """Change the displacements of a substep of dt [s], after the springs have, so that nothing crosses; pinned
         nodes stay as they are. Returns whether the step was concluded.
 
         Args:
-            state: with displacements.
             dt: [s].
             turns: that springs take, where contacts stretched them too much; contacts are resolved again then.
             conclude: has the device finish the step if three numbers there are 0, as they are where nothing remains to
                 be done: a GPU would wait while the host reads them.
         """
         self._conclude = conclude
-        self._pairs.look(state)
+        self._pairs.look()
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
         self._nodes_as_one.fill(0.0)
         if not self._is_warm:
-            self._warm_up(state)
+            self._warm_up()
             self._is_warm = True
         while True:
-            found, pushed = self._find(state, dt, turns)
+            found, pushed = self._find(dt, turns)
             if found < 0:
                 self._contacts.forget()
                 self._velocities = None
                 return False  # the solver says which quantity is not finite, or ran away
             if found:
-                self._push_in_turns(state, turns, pushed)
-            left, is_beyond, not_finite = self._keep_apart(state, found)
+                self._push_in_turns(turns, pushed)
+            left, is_beyond, not_finite = self._keep_apart(found)
             if not_finite:
                 self._velocities = None
                 return False  # as above
             # What was pushed farther than foreseen may have met what was not looked at.
             if not is_beyond:
                 break
-            self._pairs.look(state)
+            self._pairs.look()
         self._substeps += 1
         self._moved_as_one += self._nodes_as_one
         self._found += found
@@ -215,35 +208,34 @@ class ContinuousContacts:
         self._expects = found > 0
         return conclude is not None
 
-    def _warm_up(self, state: ClothState) -> None:
+    def _warm_up(self) -> None:
         """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
-        self._begin_push(state, is_first=True)()
+        self._weigh(is_first=True)
+        self._push()()
         if self._pairs.meets:
             self._pairs.warm_up()
 
-    def _find(self, state: ClothState, dt: float, turns: Turns | None) -> tuple[int, Callable[[], list[int]] | None]:
+    def _find(self, dt: float, turns: Turns | None) -> tuple[int, Callable[[], list[int]] | None]:
         """Number of contacts, or -1 where cloth has no bounds; and a first round of pushes, where that has begun.
 
         It has on a GPU, where there were contacts in the last substep: so the device need not wait for the host.
         """
-        recovery, pushed = min(1.0, dt / RECOVERY_TIME_S), None
+        recovery, pushed, pairs = min(1.0, dt / RECOVERY_TIME_S), None, self._pairs
         is_ahead = self._expects and runs_on_gpu()
         while True:
             if not is_ahead and not self._has_bounds():
                 return -1, None
-            self._pairs.find(state, self._contacts, recovery, is_ahead=is_ahead)
-            met = self._pairs.patch_pairs
-            asked = self.rigid.find(
-                state, self._patches, met.bounds.motion, met.budget.margin, self._contacts, recovery
-            )
+            pairs.find(self._contacts, recovery, is_ahead=is_ahead)
+            asked = self.rigid.find(self._state, pairs.patches, pairs.moving, self._contacts, recovery)
             if is_ahead:
-                pushed = self._push_and_measure(state, turns)
+                self._weigh(is_first=True)
+                pushed = self._push(turns)
                 if not self._has_bounds():
                     return -1, None
-                if not self._pairs.looked()[1]:
+                if not pairs.looked()[1]:
                     continue
             found, end = asked()
-            had_no_room = self._pairs.listed.reach_to(end)
+            had_no_room = pairs.listed.reach_to(end)
             if not self._contacts.make_room_for(found) and not had_no_room:
                 return found, pushed
 
@@ -252,82 +244,76 @@ class ContinuousContacts:
         motion, _ = self._pairs.looked()
         return math.isfinite(motion) and motion <= 1.0e6
 
-    def _push_in_turns(self, state: ClothState, turns: Turns | None, pushed: Callable[[], list[int]] | None) -> None:
+    def _push_in_turns(self, turns: Turns | None, pushed: Callable[[], list[int]] | None) -> None:
         """Push in turns with the springs, for as long as these need them; the first round may have `pushed` already."""
         if pushed is None:
-            pushed = self._push_and_measure(state, turns)
+            self._weigh(is_first=True)
+            pushed = self._push(turns)
         while True:
-            found = pushed()
-            pushing, _, _, settled = found
+            pushing, is_missing, settled = pushed()
             if turns is None or not (pushing or settled) or not turns.relax():
                 break
-            self._iterations += STEPS if pushing else settled
-            pushed = self._push_and_measure(state, turns, is_first=False)
-        self._push_further(state, found)
+            pushed = self._push(turns)
+        if is_missing:
+            self._push_further()
 
-    def _push_further(self, state: ClothState, found: Sequence[int]) -> None:
-        """More steps, where the round that `found` what `push` returns was not enough."""
-        pushing, _, is_missing, settled = found
-        self._iterations += STEPS if pushing else settled
-        if pushing and is_missing:
-            for step in range(0, MORE_ITERATIONS, STEPS):
-                self._push_on(state, step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
-            self._iterations += MORE_ITERATIONS
+    def _push_further(self) -> None:
+        """More steps, where those of a round were not enough."""
+        for step in range(0, MORE_ITERATIONS, STEPS):
+            self._push(first=step, settles=False, finishes=step + STEPS >= MORE_ITERATIONS)
 
-    def _push_and_measure(
-        self, state: ClothState, turns: Turns | None, *, is_first: bool = True
+    def _weigh(self, *, is_first: bool) -> None:
+        """Weigh contacts before they push; once for all rounds of what was found."""
+        weigh_contacts(self._response, self._state.vertex_count, int(is_first))
+
+    def _push(
+        self, turns: Turns | None = None, *, first: int = 0, settles: bool = True, finishes: bool = True
     ) -> Callable[[], list[int]]:
-        """A round of steps, and how long springs are after it; asks for what `push` returns."""
-        if is_first:
-            pushed = self._begin_push(state, is_first=True)
-        else:  # the same contacts, as they were weighed
-            pushed = self._push_on(state, 0, settles=True, finishes=True)
+        """`STEPS` steps of the contact iteration, from step `first` on, and how long springs are after them; asks for
+        what `push` returns.
+        """
+        momenta = _momenta_from(first)
+        pushed = push.later(
+            momenta, int(first == 0), int(settles), int(finishes), self._response, self._state.thickness
+        )
         if turns is not None:
             turns.measure()
         return pushed
 
-    def _begin_push(self, state: ClothState, *, is_first: bool) -> Callable[[], list[int]]:
-        """A round of the first `STEPS` steps; asks for what `push` returns."""
-        weigh_contacts(self._response, state.vertex_count, int(is_first))
-        return self._push_on(state, 0, settles=True, finishes=True)
-
-    def _push_on(self, state: ClothState, first: int, *, settles: bool, finishes: bool) -> Callable[[], list[int]]:
-        """Steps of the contact iteration, from step `first` on; asks for what `push` returns."""
-        momenta = _momenta_from(first)
-        return push.later(momenta, int(first == 0), int(settles), int(finishes), self._response, state.thickness)
-
     @property
     def _response(self) -> Response:
         impulses = self._contacts.impulses(self._impulse_unit)
-        return Response(self._contacts.found, impulses, self._pushed, self._sums, self.rigid.bodies.pushed)
+        return Response(self._contacts.found, impulses, self._pushed, self.rigid.pushed)
 
-    def _keep_apart(self, state: ClothState, count: int) -> Sequence[int]:
+    def _keep_apart(self, count: int) -> Sequence[int]:
         """Push, and at last tie together, until no pair can have crossed; what `SelfCollision.finish` returns then."""
+        state = self._state
         for _ in range(REPAIRS):
-            found = self._finish(state, count)
+            found = self._finish(count)
             if not found[0]:
                 return found
             self._repaired += found[0]
-            self._push_further(state, self._begin_push(state, is_first=False)())
-        found = self._finish(state, count)
+            self._weigh(is_first=False)
+            if self._push()()[1]:
+                self._push_further()
+        found = self._finish(count)
         if found[0]:
             zones, contacts = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0), self._contacts
             while found[0] and zones.join(
                 contacts.found.vertices.to_numpy()[:count][contacts.crossing.to_numpy()[:count] == 1]
             ):
                 state.displacement.from_numpy(zones.apply(state.displacement.to_numpy()))
-                found = self._finish(state, count)
+                found = self._finish(count)
             self._zone_vertices += len(zones.members)
             of_cloths = np.bincount(state.host.body[zones.members], minlength=len(self._nodes_as_one))
             np.maximum(self._nodes_as_one, of_cloths, out=self._nodes_as_one)
-        return found if not found[0] else (found[0], *self._finish(state, 0, is_changed=True)[1:])
+        return found if not found[0] else (found[0], *self._finish(0, is_changed=True)[1:])
 
-    def _finish(self, state: ClothState, count: int, *, is_changed: bool | None = None) -> Sequence[int]:
-        is_changed = count > 0 if is_changed is None else is_changed
-        asked = self._pairs.finish(state, self._sums.predicted, self._contacts, count, is_changed=is_changed)
+    def _finish(self, count: int, *, is_changed: bool = False) -> Sequence[int]:
+        asked = self._pairs.finish(self._pushed.predicted, self._contacts, count, is_changed=is_changed or count > 0)
         if self._conclude is not None:
             self._conclude(self._pairs.outcome)
-            self._velocities = box_of(state.velocity, 0, state.vertex_count, self._ends)
+            self._velocities = box_of(self._state.velocity, 0, self._state.vertex_count, self._ends)
         return asked()
 
 
@@ -355,7 +341,6 @@ class ImpactZones:
 
     def __init__(self, mass: NDArray[np.float32], pinned: NDArray[np.bool_]) -> None:
         self._mass, self._pinned = mass.astype(np.float64), pinned
-        self._links: list[NDArray[np.int64]] = []
         self.labels = np.arange(len(mass))
 
     def join(self, crossing: NDArray[np.int32]) -> bool:
@@ -364,15 +349,13 @@ class ImpactZones:
         Args:
             crossing: vertices of the pairs, (m, 4).
         """
-        n = len(self._mass)
-        quadruples = crossing.astype(np.int64)
-        self._links += [np.stack([quadruples[:, 0], quadruples[:, k]], axis=1) for k in (1, 2, 3)]
-        links = np.unique(np.concatenate(self._links), axis=0)
-        graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-        count, labels = connected_components(graph, directed=False)
-        grew = count < len(np.unique(self.labels))
-        self.labels = labels
-        return grew
+        first, *others = self.labels[crossing].T
+        count = int(self.labels.max()) + 1
+        links = np.tile(first, 3), np.concatenate(others)
+        graph = coo_array((np.ones(len(links[0])), links), shape=(count, count))
+        found, zone_of_zone = connected_components(graph, directed=False)
+        self.labels = zone_of_zone[self.labels]
+        return bool(found < count)
 
     @property
     def members(self) -> NDArray[np.int64]:

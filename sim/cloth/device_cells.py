@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.bundles import CellArrays, MeshNodes, Nodes, Strains
 from sim.cloth.cells import OWN_SHARE, RECTANGLE, TRIANGLE, Cells
-from sim.cloth.device_springs import LANES, TINY_LENGTH, colour_bounds, colour_groups, column, set_column
+from sim.cloth.device_springs import LANES, TINY_LENGTH, Bounds, colour_groups, column, set_column
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import pieces_of
 from sim.core.arrays import Floats, Vectors, on_device
@@ -33,9 +33,7 @@ class DeviceCells:
         law: as `Cells.law` has it, (count, 4).
         is_damped: whether any of them is.
         cloths: numbers of the cloths that they belong to.
-        first_colours: as of `DeviceSprings`.
-        mesh: nodes of triangles; nothing of rectangles.
-        own, chunks, pieces: how many nodes, chunks and pieces those are.
+        colours, bounds: number of colours, and bounds of all of them.
     """
 
     def __init__(self, cells: Cells, cloth_of: NDArray[np.int32]) -> None:
@@ -44,11 +42,11 @@ class DeviceCells:
         self.arity, self.count = cells.arity, len(cells)
         self.law: NDArray[np.float64] = np.zeros((self.count, 4))
         self.is_damped = False
-        self.first_colours, cell_of_colour = colour_groups(cells.colour, np.arange(self.count), self.count)
+        self.colours, (self.bounds,) = colour_groups(cells.colour)
+        law = ti.Vector.ndarray(4, ti.f32, self.count)
         multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
-        self.mesh, self.own, self.chunks, self.pieces = _mesh_nodes(cells)
         listed = (on_device(each.ravel()) for each in (cells.nodes, cells.along, cells.across))
-        self.on_device = CellArrays(*listed, ti.Vector.ndarray(4, ti.f32, self.count), cell_of_colour, multiplier)
+        self.on_device = CellArrays(self.count, *listed, law, multiplier, _mesh_nodes(cells))
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
@@ -59,16 +57,17 @@ class DeviceCells:
         self.on_device.law.from_numpy(self.law.astype(np.float32))
         if self.arity == TRIANGLE:
             nodes, weight = self.host.nodes.ravel(), np.repeat(self.law[:, 0], TRIANGLE)
-            self.mesh.share.from_numpy((weight / np.bincount(nodes, weights=weight)[nodes]).astype(np.float32))
+            share = weight / np.bincount(nodes, weights=weight)[nodes]
+            self.on_device.mesh.share.from_numpy(share.astype(np.float32))
 
     def measure_strains(self, nodes: Nodes, *, is_damped: bool) -> None:
-        """Mean strains of the nodes of triangles, as they are, with what damping adds to them."""
+        """Mean strains of the nodes of triangles, as they are, with what damping adds to them if it shall."""
         if self.arity == TRIANGLE:
-            measure_strains(self.on_device, self.count, self.mesh, self.own, nodes, int(is_damped))
+            measure_strains(self.on_device, nodes, int(is_damped))
 
 
-def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
-    """The nodes of triangles, connected piece by piece; how many nodes, chunks and pieces."""
+def _mesh_nodes(cells: Cells) -> MeshNodes:
+    """The nodes of triangles, connected piece by piece."""
     triangles = cells.nodes if cells.arity == TRIANGLE else np.zeros((0, TRIANGLE), dtype=np.int32)
     count = int(triangles.max(initial=-1)) + 1
     label = pieces_of(triangles)
@@ -81,7 +80,10 @@ def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
     ends, size = np.append(0, np.cumsum(np.bincount(piece))), max(1, round(len(own) ** 0.5))
     chunks = [np.arange(first, end, size) for first, end in pairwise(ends)]
     first = np.concatenate([*chunks, [len(own)]])
-    mesh = MeshNodes(
+    return MeshNodes(
+        count=len(own),
+        chunks=len(first) - 1,
+        pieces=len(chunks),
         node=on_device(own),
         start=on_device(np.append(0, np.cumsum(np.bincount(place)))),
         corner=on_device(np.argsort(place, kind="stable")),
@@ -93,7 +95,6 @@ def _mesh_nodes(cells: Cells) -> tuple[MeshNodes, int, int, int]:
         chunk=on_device(first),
         first_chunk=on_device(np.append(0, np.cumsum([len(chunk) for chunk in chunks])).astype(np.int32)),
     )
-    return mesh, len(own), len(first) - 1, len(chunks)
 
 
 @func
@@ -101,12 +102,10 @@ def derivative(
     coefficients: Floats, cells: CellArrays, nodes: Nodes, displacement: Vectors, s: ti.i32, arity: ti.template()
 ) -> ti.math.vec3:
     """sum_a c_a x_a displaced; from differences, exact in integers, as sum_a c_a = 0."""
-    d = ti.math.vec3(0.0)
-    moved = ti.math.vec3(0.0)
+    d, moved = ti.math.vec3(0.0), ti.math.vec3(0.0)
     first = nodes.lattice[cells.nodes[arity * s]]
     for a in ti.static(range(arity)):
-        i = cells.nodes[arity * s + a]
-        c_a = coefficients[arity * s + a]
+        i, c_a = cells.nodes[arity * s + a], coefficients[arity * s + a]
         if ti.static(a > 0):
             d += c_a * ti.cast(nodes.lattice[i] - first, ti.f32)
         moved += c_a * displacement[i]
@@ -114,12 +113,14 @@ def derivative(
 
 
 @func
-def velocity_derivative(coefficients: Floats, cells: CellArrays, nodes: Nodes, s: ti.i32, arity: ti.template()):
-    """sum_a c_a v_a [1/s]."""
-    rate = ti.math.vec3(0.0)
+def change_of(
+    coefficients: Floats, cells: CellArrays, vectors: Vectors, s: ti.i32, arity: ti.template()
+) -> ti.math.vec3:
+    """sum_a c_a of vectors at the nodes of a cell."""
+    total = ti.math.vec3(0.0)
     for a in ti.static(range(arity)):
-        rate += coefficients[arity * s + a] * nodes.velocity[cells.nodes[arity * s + a]]
-    return rate
+        total += coefficients[arity * s + a] * vectors[cells.nodes[arity * s + a]]
+    return total
 
 
 @func
@@ -204,11 +205,12 @@ def solve_shear(
 
 
 @large_kernel
-def solve_shears(cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: ti.i32, colours: ti.template()):
+def solve_shears(
+    cells: CellArrays, bounds: Bounds, nodes: Nodes, dt_squared: ti.f32, is_first: ti.i32, colours: ti.template()
+):
     """The cells of all colours, one after the other; if `is_first`, `SHEAR_SWEEPS` times, from multipliers of 0."""
-    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     lanes = ti.static(1 if runs_on_gpu() else LANES)
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, 0, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = bounds
     for sweep in ti.static(range(SHEAR_SWEEPS)):
         for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
             for s in range(begin, end):
@@ -218,16 +220,15 @@ def solve_shears(cells: CellArrays, nodes: Nodes, dt_squared: ti.f32, is_first: 
 
 
 @kernel
-def damp_shears(cells: CellArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, colours: ti.template()):
+def damp_shears(cells: CellArrays, bounds: Bounds, nodes: Nodes, dt: ti.f32, colours: ti.template()):
     """Implicit Euler of the forces -tau k de/dt of the shear of so many colours, one after the other."""
-    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(cells.cell_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = bounds
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
             d_u = derivative(cells.along, cells, nodes, nodes.carry, s, RECTANGLE)
             d_v = derivative(cells.across, cells, nodes, nodes.carry, s, RECTANGLE)
-            rate_u = velocity_derivative(cells.along, cells, nodes, s, RECTANGLE)
-            rate_v = velocity_derivative(cells.across, cells, nodes, s, RECTANGLE)
+            rate_u = change_of(cells.along, cells, nodes.velocity, s, RECTANGLE)
+            rate_v = change_of(cells.across, cells, nodes.velocity, s, RECTANGLE)
             _, by_u, by_v = shear_of(d_u, d_v)
             strength = cells.law[s][1] * cells.law[s][3] * dt
             change = -strength * (by_u.dot(rate_u) + by_v.dot(rate_v))
@@ -247,8 +248,9 @@ def mean_strain(k: ti.i32, mesh: MeshNodes, strain: Strains) -> ti.math.vec2:
 
 
 @func
-def tension_of(s: ti.i32, cells: CellArrays, mesh: MeshNodes, strain: Strains, mean: Strains) -> ti.math.vec2:
+def tension_of(s: ti.i32, cells: CellArrays, strain: Strains, mean: Strains) -> ti.math.vec2:
     """Tensions of a triangle along warp and weft [J], from its own strain and the mean ones of its nodes."""
+    (mesh,) = ti.static((cells.mesh,))
     felt = OWN_SHARE * strain[s]
     for a in ti.static(range(TRIANGLE)):
         of_node = mean[cells.nodes[TRIANGLE * s + a]]
@@ -256,40 +258,47 @@ def tension_of(s: ti.i32, cells: CellArrays, mesh: MeshNodes, strain: Strains, m
     return cells.law[s][0] * (felt + cells.law[s][2] * felt.yx)
 
 
-@kernel
-def measure_strains(cells: CellArrays, count: ti.i32, mesh: MeshNodes, own: ti.i32, nodes: Nodes, is_damped: ti.i32):
-    """Strains of triangles, with tau times their rates if `is_damped`; then of nodes."""
-    for s in range(count):
-        d_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
-        d_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
+@func
+def strain_by(displacement: Vectors, is_damped: ti.i32, cells: CellArrays, nodes: Nodes):
+    """Strains of triangles where displacements lead, with tau times their rates if `is_damped`; then of nodes. For the
+    outermost level of a kernel.
+    """
+    (mesh,) = ti.static((cells.mesh,))
+    for s in range(cells.count):
+        d_u = derivative(cells.along, cells, nodes, displacement, s, TRIANGLE)
+        d_v = derivative(cells.across, cells, nodes, displacement, s, TRIANGLE)
         length, length_across = ti.max(d_u.norm(), TINY_LENGTH), ti.max(d_v.norm(), TINY_LENGTH)
         mesh.strain[s] = ti.math.vec2(length - 1.0, length_across - 1.0)
         if is_damped:
-            rate_u = d_u.dot(velocity_derivative(cells.along, cells, nodes, s, TRIANGLE)) / length
-            rate_v = d_v.dot(velocity_derivative(cells.across, cells, nodes, s, TRIANGLE)) / length_across
+            rate_u = d_u.dot(change_of(cells.along, cells, nodes.velocity, s, TRIANGLE)) / length
+            rate_v = d_v.dot(change_of(cells.across, cells, nodes.velocity, s, TRIANGLE)) / length_across
             mesh.strain[s] = mesh.strain[s] + cells.law[s][3] * ti.math.vec2(rate_u, rate_v)
-    for k in range(own):
+    for k in range(mesh.count):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
 
 
 @kernel
-def compute_cell_forces(
-    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, first: ti.i32, count: ti.i32, arity: ti.template(), force: Vectors
-):
+def measure_strains(cells: CellArrays, nodes: Nodes, is_damped: ti.i32):
+    """Strains of triangles and nodes as they are."""
+    strain_by(nodes.carry, is_damped, cells, nodes)
+
+
+@kernel
+def compute_cell_forces(cells: CellArrays, nodes: Nodes, first: ti.i32, arity: ti.template(), force: Vectors):
     """-dW/dd_u and -dW/dd_v of each cell with damping [N m], one after the other from `first` on, after
     `measure_strains`.
     """
-    for s in range(count):
+    for s in range(cells.count):
         d_u = derivative(cells.along, cells, nodes, nodes.carry, s, arity)
         d_v = derivative(cells.across, cells, nodes, nodes.carry, s, arity)
-        rate_u = velocity_derivative(cells.along, cells, nodes, s, arity)
-        rate_v = velocity_derivative(cells.across, cells, nodes, s, arity)
+        rate_u = change_of(cells.along, cells, nodes.velocity, s, arity)
+        rate_v = change_of(cells.across, cells, nodes.velocity, s, arity)
         law = cells.law[s]
         shear, by_u, by_v = shear_of(d_u, d_v)
         moment = -law[1] * (shear + law[3] * (by_u.dot(rate_u) + by_v.dot(rate_v)))
         f_u, f_v = moment * by_u, moment * by_v
         if ti.static(arity == TRIANGLE):
-            tension = tension_of(s, cells, mesh, mesh.strain, mesh.mean)
+            tension = tension_of(s, cells, cells.mesh.strain, cells.mesh.mean)
             f_u -= tension[0] / ti.max(d_u.norm(), TINY_LENGTH) * d_u
             f_v -= tension[1] / ti.max(d_v.norm(), TINY_LENGTH) * d_v
         force[first + 2 * s] = f_u
@@ -297,18 +306,17 @@ def compute_cell_forces(
 
 
 @kernel
-def sum_over_cells(
-    cells: CellArrays, mesh: MeshNodes, nodes: Nodes, count: ti.i32, arity: ti.template(), share: Share
-) -> Results:
+def sum_over_cells(cells: CellArrays, nodes: Nodes, arity: ti.template(), share: Share) -> Results:
     """Largest mean strain of nodes of triangles along warp and weft; elastic energy; after `measure_strains`."""
+    mesh, tree = ti.static((cells.mesh, share.tree))
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
-    for lane in range(share.tree.lanes):
+    for lane in range(tree.lanes):
         largest = 0.0
         energy = 0.0
         for k in range(share.items):
             s = lane * share.lane_step + k * share.item_step
-            if s < count:
+            if s < cells.count:
                 d_u = derivative(cells.along, cells, nodes, nodes.carry, s, arity)
                 d_v = derivative(cells.across, cells, nodes, nodes.carry, s, arity)
                 law = cells.law[s]
@@ -322,6 +330,6 @@ def sum_over_cells(
                         largest = ti.max(largest, e.x, e.y)
                         share_of_node = 0.5 * (1.0 - OWN_SHARE) / TRIANGLE
                         energy += share_of_node * law[0] * (e.dot(e) + 2.0 * law[2] * e.x * e.y)
-        share.tree.partial[lane] = largest
-        share.tree.partial[share.tree.lanes + lane] = energy
-    return reduced_tree(share.tree)
+        tree.partial[lane] = largest
+        tree.partial[tree.lanes + lane] = energy
+    return reduced_tree(tree)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import Contraction, Nodes, SpringArrays
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.springs import Springs
-from sim.core.arrays import Integers, Vectors, on_device
+from sim.core.arrays import Vectors, on_device
 from sim.core.bundles import func
 from sim.core.launch import kernel
 
@@ -47,8 +47,8 @@ class DeviceSprings:
         poisson: Poisson's ratio of the cloth that a spring of a thread belongs to [-], (count,).
         is_damped: whether any of them is.
         contracts: whether any of them feels the strain across.
-        first_colours: first colour of each group of those that are solved in one launch, `first_colours.step` each;
-            the last group may have empty ones.
+        colours: bounds of the colours that are solved in one launch, of each; `at_once` each, of which the last may be
+            empty.
         in_segments: whether these are threads.
         host: the springs on the host.
         cloths: numbers of the cloths that they belong to; `cloth_of` that of each, (count,).
@@ -60,14 +60,14 @@ class DeviceSprings:
         self.arity, self.count = springs.arity, len(springs)
         self.in_segments = springs.in_segments
         starts = np.flatnonzero(np.diff(springs.segment, prepend=-1)) if self.in_segments else np.arange(self.count)
-        self.first_colours, piece_of_colour = colour_groups(springs.colour, starts, len(starts))
+        self.at_once, self.colours = colour_groups(springs.colour[starts])
         self.on_device = SpringArrays(
+            count=self.count,
             nodes=on_device(springs.nodes.ravel()),
             law=ti.Vector.ndarray(3, ti.f32, self.count),
             coefficients=on_device(springs.coefficients.ravel() if self.arity == 4 else np.zeros(1)),
             shift=ti.ndarray(ti.f32, self.count),
             segment_start=on_device(np.append(starts, self.count)),
-            piece_of_colour=piece_of_colour,
         )
         self.stiffness: NDArray[np.float64] = np.zeros(self.count)
         self.damping: NDArray[np.float64] = np.zeros(self.count)
@@ -102,41 +102,43 @@ class DeviceSprings:
         of them has the energy C nu e_x e_y of the sheet in the corner of a cell between them.
         """
         if self.contracts:
-            measure_contraction(self.on_device, self._contraction, nodes, displacement, self.count)
+            measure_contraction(self.on_device, self._contraction, nodes, displacement)
 
 
-def colour_groups(colours: NDArray[np.int32], starts: NDArray[np.integer], count: int) -> tuple[range, ti.Ndarray]:
-    """First colour of each group of up to `MOST_COLOURS_AT_ONCE`, as many in each; first piece of each colour, and
-    number of pieces from there on.
+Bounds = ti.types.vector(MOST_COLOURS_AT_ONCE + 1, ti.i32)
+"""Where the pieces of each colour of a launch begin, and where the last one ends; that as often as it takes.
+
+For variables of their own: elements of a vector would be read between two loops, by a launch of its own on a GPU."""
+
+
+def colour_groups(colours: NDArray[np.int32]) -> tuple[int, list[tuple[int, ...]]]:
+    """How many colours are solved in a launch, and the bounds of those of each; as many in each as it comes.
 
     Args:
-        colours: of springs or cells, sorted.
-        starts: first of them of each piece.
-        count: number of pieces.
+        colours: of springs, cells or pieces, sorted.
     """
-    firsts = np.flatnonzero(np.diff(colours[starts], prepend=-1))
+    firsts = np.flatnonzero(np.diff(colours, prepend=-1)).tolist()
     launches = max(1, -(-len(firsts) // MOST_COLOURS_AT_ONCE))
-    groups = range(0, len(firsts), max(1, -(-len(firsts) // launches)))
-    padding = [count] * (len(groups) * groups.step + 1 - len(firsts))
-    firsts = np.concatenate([firsts, padding])
-    return groups, on_device(firsts.astype(np.int32))
+    at_once = max(1, -(-len(firsts) // launches))
+    bounds = [*firsts, *[len(colours)] * (MOST_COLOURS_AT_ONCE + 1)]
+    return at_once, [
+        tuple(bounds[min(first + k, first + at_once)] for k in range(MOST_COLOURS_AT_ONCE + 1))
+        for first in range(0, len(firsts), at_once)
+    ]
 
 
 @kernel
-def measure_contraction(
-    springs: SpringArrays, contraction: Contraction, nodes: Nodes, displacement: Vectors, count: ti.i32
-):
+def measure_contraction(springs: SpringArrays, contraction: Contraction, nodes: Nodes, displacement: Vectors):
     """Shifts of springs from the strains of nodes; of these, two springs at most add to one, in either order."""
     for k in range(contraction.strain.shape[0]):
         contraction.strain[k] = 0.0
-    for s in range(count):
+    for s in range(springs.count):
         i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-        d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (displacement[i] - displacement[j])
-        strain = d.norm() / springs.law[s][0] - 1.0
+        strain = between(i, j, nodes, displacement).norm() / springs.law[s][0] - 1.0
         for end in ti.static((i, j)):
             place = 2 * end + contraction.axis[s]
             ti.atomic_add(contraction.strain[place], contraction.share[place] * strain)
-    for s in range(count):
+    for s in range(springs.count):
         other = 1 - contraction.axis[s]
         i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
         across = 0.5 * (contraction.strain[2 * i + other] + contraction.strain[2 * j + other])
@@ -154,17 +156,19 @@ def coefficient(springs: SpringArrays, s: ti.i32, arity: ti.template(), a: ti.te
     return value
 
 
-@ti.func
-def colour_bounds(piece_of_colour: Integers, first: ti.i32, colours: ti.template(), threads: ti.template()):
-    """Where each of some colours begins, from `first` on, and where the last one ends, times the threads of a piece;
-    the last as often as it takes for `MOST_COLOURS_AT_ONCE`.
+@func
+def between(i: ti.i32, j: ti.i32, nodes: Nodes, displacement: Vectors) -> ti.math.vec3:
+    """x_i - x_j displaced [m]."""
+    return nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (displacement[i] - displacement[j])
 
-    For variables of their own: elements of a vector would be read between two loops, by a launch of its own on a GPU.
-    """
-    ti.static_assert(colours <= MOST_COLOURS_AT_ONCE, "more colours than are solved in one launch")
-    return threads * ti.Vector(
-        [piece_of_colour[first + ti.static(min(k, colours))] for k in ti.static(range(MOST_COLOURS_AT_ONCE + 1))]
-    )
+
+@func
+def span(springs: SpringArrays, nodes: Nodes, displacement: Vectors, s: ti.i32, arity: ti.template()) -> ti.math.vec3:
+    """sum_a c_a x_a displaced [m]."""
+    d = separation(springs, nodes, s, arity)
+    for a in ti.static(range(arity)):
+        d += coefficient(springs, s, arity, a) * displacement[springs.nodes[arity * s + a]]
+    return d
 
 
 @func

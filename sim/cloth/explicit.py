@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 
 from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, compute_cell_forces
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, span
 from sim.cloth.springs import longest_explicit_step
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
@@ -66,12 +66,10 @@ class ExplicitSprings:
         state = self._state
         for first, springs in zip(self._first, self._springs, strict=False):
             springs.contract(state.nodes, state.carry)
-            compute_spring_forces(springs.on_device, state.nodes, int(first), springs.count, springs.arity, self._force)
+            compute_spring_forces(springs.on_device, state.nodes, int(first), springs.arity, self._force)
         for first, cells in zip(self._first[len(self._springs) :], self._cells, strict=False):
             cells.measure_strains(state.nodes, is_damped=True)
-            compute_cell_forces(
-                cells.on_device, cells.mesh, state.nodes, int(first), cells.count, cells.arity, self._force
-            )
+            compute_cell_forces(cells.on_device, state.nodes, int(first), cells.arity, self._force)
         gather_spring_forces(
             self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
         )
@@ -84,17 +82,12 @@ class ExplicitSprings:
 
 
 @kernel
-def compute_spring_forces(
-    springs: SpringArrays, nodes: Nodes, first: ti.i32, count: ti.i32, arity: ti.template(), force: Vectors
-):
+def compute_spring_forces(springs: SpringArrays, nodes: Nodes, first: ti.i32, arity: ti.template(), force: Vectors):
     """-k (C + tau dC/dt) d/|d| of each spring [N]."""
-    for s in range(count):
-        d = separation(springs, nodes, s, arity)
-        rate = ti.math.vec3(0.0)
+    for s in range(springs.count):
+        d, rate = span(springs, nodes, nodes.carry, s, arity), ti.math.vec3(0.0)
         for a in ti.static(range(arity)):
-            c_a = coefficient(springs, s, arity, a)
-            d += c_a * nodes.carry[springs.nodes[arity * s + a]]
-            rate += c_a * nodes.velocity[springs.nodes[arity * s + a]]
+            rate += coefficient(springs, s, arity, a) * nodes.velocity[springs.nodes[arity * s + a]]
         length = d.norm()
         value = ti.math.vec3(0.0)
         if length > TINY_LENGTH:

@@ -2,27 +2,14 @@
 
 import taichi as ti
 
-from sim.cloth.bundles import (
-    Boxes,
-    Contacts,
-    Counters,
-    EdgeBlocks,
-    Four,
-    PairPieces,
-    PatchBlocks,
-    PatchPairArrays,
-    Rest,
-    Surface,
-    TriangleBlocks,
-    Two,
-)
+from sim.cloth.bundles import Four, PairPieces, PairSearch, PatchBlocks
 from sim.cloth.patches import BLOCK, FAR, NONE
 from sim.cloth.proximity import closest_on_edges, closest_on_triangle, distance_of_edges, distance_to_triangle, unit_or
 from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, append_contact, least_displacement
 from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
-from sim.core.reductions import Results, Share, reduced, runs_on_gpu
+from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 from sim.core.scheduling import NO_MORE, begin_sharing, next_item
 from sim.core.warps import WARP, raise_to, whole_warps
 
@@ -66,40 +53,18 @@ times what sums of float32 lose, so that what is found does not depend on when l
 
 
 @ti.func
-def share_no_vertex(e: Two, f: Two) -> ti.i32:
-    """Whether two edges have four different ends."""
-    nearest = ti.min(ti.abs(e[0] - f[0]), ti.abs(e[0] - f[1]), ti.abs(e[1] - f[0]), ti.abs(e[1] - f[1]))
-    return ti.cast(nearest > 0, ti.i32)
-
-
-@func
-def pair_thickness(a: ti.i32, b: ti.i32, rest: Rest, surface: Surface, at_rest: ti.f32) -> ti.f32:
-    """Distance that two elements keep [m]: between different cloths, or within one, where it is shorter at rest."""
-    wanted = 0.5 * (surface.thickness[a] + surface.thickness[b])
-    return ti.select(rest.cloth[a] == rest.cloth[b], ti.min(wanted, OF_REST_DISTANCE * at_rest), wanted)
-
-
-@ti.func
 def lowest_bit(bits: ti.i32) -> ti.i32:
     """Number of the lowest bit that is set, of less than 2^24: a float32 has it in its exponent."""
     return (ti.bit_cast(ti.cast(bits & -bits, ti.f32), ti.i32) >> 23) - 127
 
 
 @func
-def pair_vertices_with_triangles(
-    p: ti.i32,
-    thread: ti.i32,
-    lanes: ti.i32,
-    parts: ti.template(),
-    met: PatchPairArrays,
-    boxes: Boxes,
-    surface: Surface,
-    blocks: PatchBlocks,
-    found: PairPieces,
-):
+def pair_vertices_with_triangles(p: ti.i32, thread: ti.i32, lanes: ti.i32, parts: ti.template(), search: PairSearch):
     """List the vertices of each of two patches that are near triangles of the other, as one of several threads, of
     which `parts` share a vertex.
     """
+    met, boxes, surface = ti.static((search.met, search.boxes, search.surface))
+    blocks, found = ti.static((search.blocks, search.listed))
     tested = ti.static(BLOCK // parts)
     soonest, at_once = NEVER, lanes // parts
     lane, low = thread % at_once, thread // at_once * tested
@@ -143,21 +108,13 @@ def pair_vertices_with_triangles(
 
 
 @func
-def pair_edges(
-    p: ti.i32,
-    thread: ti.i32,
-    lanes: ti.i32,
-    parts: ti.i32,
-    met: PatchPairArrays,
-    boxes: Boxes,
-    blocks: EdgeBlocks,
-    found: PairPieces,
-):
+def pair_edges(p: ti.i32, thread: ti.i32, lanes: ti.i32, parts: ti.i32, search: PairSearch):
     """List the edges of two patches that are near each other and share no vertex, as one of several threads.
 
     Edges are first told apart by their shadows on the line through their midpoints, and on what of that is across the
     first of them: disjoint for most neighbours in flat cloth, where spheres around them are not.
     """
+    met, boxes, blocks, found = ti.static((search.met, search.boxes, search.blocks.edges, search.listed))
     soonest, lane, part = NEVER, thread % lanes, thread // lanes
     m, other = met.pairs[p][0], met.pairs[p][1]
     within = met.reach[p] * met.reach[p]
@@ -194,7 +151,7 @@ def pair_edges(
                     there = block * BLOCK + lowest_bit(near)
                     near &= near - 1
                     f = blocks.edges[there]
-                    if share_no_vertex(e, f) == 1:
+                    if ti.min(ti.abs(e[0] - f[0]), ti.abs(e[0] - f[1]), ti.abs(e[1] - f[0]), ti.abs(e[1] - f[1])) > 0:
                         between = ti.math.vec3(blocks.mid_x[there], blocks.mid_y[there], blocks.mid_z[there]) - middle
                         far_half = ti.math.vec3(blocks.half_x[there], blocks.half_y[there], blocks.half_z[there])
                         apart = distance_of_edges(-half, half, between - far_half, between + far_half)
@@ -212,21 +169,13 @@ def pair_edges(
 
 
 @func
-def search_piece(
-    piece: ti.i32,
-    thread: ti.i32,
-    met: PatchPairArrays,
-    boxes: Boxes,
-    surface: Surface,
-    blocks: PatchBlocks,
-    found: PairPieces,
-):
+def search_piece(piece: ti.i32, thread: ti.i32, search: PairSearch):
     """List what one piece of a pair of patches has, as one of several threads."""
     lanes, parts, of_vertex = ti.static((on_gpu(LANES), on_gpu(EDGE_PARTS), on_gpu(VERTEX_PARTS)))
     if piece % 2 == 0:
-        pair_vertices_with_triangles(piece // 2, thread, lanes * parts, of_vertex, met, boxes, surface, blocks, found)
+        pair_vertices_with_triangles(piece // 2, thread, lanes * parts, of_vertex, search)
     else:
-        pair_edges(piece // 2, thread, lanes, parts, met, boxes, blocks.edges, found)
+        pair_edges(piece // 2, thread, lanes, parts, search)
 
 
 @func
@@ -243,12 +192,10 @@ def lengthen(piece: ti.i32, listed: PairPieces):
 def carry_pieces(
     count: ti.i32, workers: ti.i32, taken: Integers, carried: Integers, before: PairPieces, now: PairPieces
 ):
-    """So many pieces of pairs of patches that were listed before, at the places of their numbers now.
+    """So many pieces of pairs of patches that were listed before, at the places of their numbers now; `carried` are
+    the numbers that they had, or -1.
 
     Those that have any elements are listed in `again` meanwhile, as most have none.
-
-    Args:
-        carried: numbers that pairs of patches had before, or -1.
     """
     lanes = ti.static(on_gpu(LANES))
     now.ends[0], now.ends[1] = 0, 0
@@ -286,21 +233,11 @@ def keep_pairs(count: ti.i32, before: PairPieces, now: PairPieces):
 
 
 @func
-def look_at_piece(
-    both: ti.i32,
-    lane: ti.i32,
-    lanes: ti.template(),
-    listed: PairPieces,
-    met: PatchPairArrays,
-    are_edges: ti.template(),
-    surface: Surface,
-    rest: Rest,
-    recovery: ti.f32,
-    contacts: Contacts,
-):
+def look_at_piece(both: ti.i32, lane: ti.i32, lanes: ti.template(), are_edges: ti.template(), search: PairSearch):
     """Look at the pairs of elements of one pair of patches that are due, as one of several threads; or at none, as
     `NO_MORE` of them.
     """
+    listed, met = ti.static((search.listed, search.met))
     piece = 2 * both + ti.cast(are_edges, ti.i32)
     soonest, is_left = NEVER, met.left[both]
     place, end = lane, listed.pieces[piece][2]
@@ -308,25 +245,16 @@ def look_at_piece(
     while place < end:
         p = first + place
         if listed.due[p] >= is_left:
-            listed.due[p] = look_at_pair(p, both, listed, met, are_edges, surface, rest, recovery, contacts)
+            listed.due[p] = look_at_pair(p, both, are_edges, search)
         soonest = ti.max(soonest, listed.due[p])
         place += lanes
     raise_to(listed.piece_due, piece, soonest, lane, lanes)
 
 
 @func
-def look_at_pair(
-    p: ti.i32,
-    both: ti.i32,
-    listed: PairPieces,
-    met: PatchPairArrays,
-    are_edges: ti.template(),
-    surface: Surface,
-    rest: Rest,
-    recovery: ti.f32,
-    contacts: Contacts,
-) -> ti.f32:
+def look_at_pair(p: ti.i32, both: ti.i32, are_edges: ti.template(), search: PairSearch) -> ti.f32:
     """Append a pair if it has to be; returns when it is due [m]."""
+    listed, met, surface, at_rest = ti.static((search.listed, search.met, search.surface, search.rest.position))
     v, approach, allowed = listed.pairs[p], met.approach[both], met.allowed[both]
     x, u = surface.position[v[0]], surface.displacement[v[0]]
     x1, x2, x3 = surface.position[v[1]] - x, surface.position[v[2]] - x, surface.position[v[3]] - x
@@ -346,19 +274,16 @@ def look_at_pair(
         weight = ti.math.vec4(1.0, -shares[0], -shares[1], -shares[2])
     apart = weight[1] * x1 + weight[2] * x2 + weight[3] * x3
     distance = apart.norm()
-    if distance < ti.max(0.5 * (surface.thickness[v[0]] + surface.thickness[v[2]]), approach + allowed):
+    thickness = 0.5 * (surface.thickness[v[0]] + surface.thickness[v[2]])
+    if distance < ti.max(thickness, approach + allowed):
         u1, u2, u3 = surface.displacement[v[1]] - u, surface.displacement[v[2]] - u, surface.displacement[v[3]] - u
         mean = 0.25 * (u1 + u2 + u3)
         motion = ti.max(mean.norm(), (u1 - mean).norm(), (u2 - mean).norm(), (u3 - mean).norm())
         if listed.wanted[p] == UNKNOWN:
-            a, b, c, d = (
-                rest.position[v[0]],
-                rest.position[v[1]],
-                rest.position[v[2]],
-                rest.position[v[3]],
-            )
-            at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
-            listed.wanted[p] = pair_thickness(v[0], v[2], rest, surface, at_rest)
+            a, b, c, d = at_rest[v[0]], at_rest[v[1]], at_rest[v[2]], at_rest[v[3]]
+            apart_at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
+            is_own = search.rest.cloth[v[0]] == search.rest.cloth[v[2]]
+            listed.wanted[p] = ti.select(is_own, ti.min(thickness, OF_REST_DISTANCE * apart_at_rest), thickness)
         keeps = part * listed.wanted[p]
         if distance < ti.max(keeps, ti.min(2.0 * motion, approach) + allowed):
             across = x1.cross(x3 - x2) if ti.static(are_edges) else (x2 - x1).cross(x3 - x1)
@@ -366,30 +291,31 @@ def look_at_pair(
             # At a millionth of an element, rounding turns `apart` by so much that no plane across it is between both.
             if is_inside and ti.abs(across.dot(n)) > ALONG_NORMAL * across.norm():
                 n = ti.math.sign(across.dot(n)) * unit_or(across, n)
-            least = least_displacement(distance, keeps, recovery)
+            least = least_displacement(distance, keeps, search.recovery)
             pushes = distance < keeps or n.dot(weight[1] * u1 + weight[2] * u2 + weight[3] * u3) < least
             floor = ti.select(pushes and keeps > 0.0, least, INACTIVE)
             kind = EDGE_EDGE if ti.static(are_edges) else VERTEX_TRIANGLE
             friction = ti.sqrt(surface.friction[v[0]] * surface.friction[v[2]])
-            append_contact(contacts, v, weight, n, floor, kind, zero, friction)
+            append_contact(search.contacts, v, weight, n, floor, kind, zero, friction)
     return met.slack[both] - distance
 
 
 @kernel
 def range_of_vectors(vectors: Vectors, first: ti.i32, count: ti.i32, share: Share) -> Results:
     """Largest components of some vectors, then those of the negative ones, six maxima."""
-    for lane in range(share.tree.lanes):
+    (tree,) = ti.static((share.tree,))
+    for lane in range(tree.lanes):
         most, least = ti.math.vec3(-FAR), ti.math.vec3(FAR)
         for k in range(share.items):
             i = lane * share.lane_step + k * share.item_step
             if i < count:
                 most, least = ti.max(most, vectors[first + i]), ti.min(least, vectors[first + i])
         for axis in ti.static(range(3)):
-            (
-                share.tree.partial[axis * share.tree.lanes + lane],
-                share.tree.partial[(3 + axis) * share.tree.lanes + lane],
-            ) = most[axis], -least[axis]
-    return reduced(share.tree.partial, share.tree.lanes, share.tree.quantities, share.tree.maxima, share.tree.nodes)
+            tree.partial[axis * tree.lanes + lane], tree.partial[(3 + axis) * tree.lanes + lane] = (
+                most[axis],
+                -least[axis],
+            )
+    return reduced_tree(tree)
 
 
 ENCLOSED_AT_A_TIME, SEARCHED_AT_A_TIME, DUE_AT_A_TIME = 8, 1, 4
@@ -397,17 +323,11 @@ ENCLOSED_AT_A_TIME, SEARCHED_AT_A_TIME, DUE_AT_A_TIME = 8, 1, 4
 
 
 @func
-def enclose_elements(
-    m: ti.i32,
-    lane: ti.i32,
-    lanes: ti.i32,
-    position: Vectors,
-    of_edges: EdgeBlocks,
-    of_triangles: TriangleBlocks,
-):
+def enclose_elements(m: ti.i32, lane: ti.i32, lanes: ti.i32, position: Vectors, blocks: PatchBlocks):
     """Midpoints of edges and half the vectors along them, and boxes of triangles, of a patch, as one of several
     threads.
     """
+    of_edges, of_triangles = ti.static((blocks.edges, blocks.triangles))
     place = of_edges.first_block[m] * BLOCK + lane
     while place < of_edges.first_block[m + 1] * BLOCK:
         middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
@@ -430,18 +350,7 @@ def enclose_elements(
 
 
 @large_kernel
-def find_near_pairs(
-    numbers: ti.math.ivec3,
-    counters: Counters,
-    met: PatchPairArrays,
-    boxes: Boxes,
-    blocks: PatchBlocks,
-    listed: PairPieces,
-    surface: Surface,
-    rest: Rest,
-    recovery: ti.f32,
-    contacts: Contacts,
-):
+def find_near_pairs(numbers: ti.math.ivec3, search: PairSearch):
     """List the elements of the pairs of patches that are `expired`: the vertices of each of two patches with the
     triangles of the other within `reach` [m] of them, and the edges of both within that of each other. Then append the
     listed pairs that are nearer than they shall be, or get there, and those that might cross.
@@ -458,20 +367,16 @@ def find_near_pairs(
     Args:
         numbers: whether to search, not if that is done, and only room was missing; most pairs of elements; workers
             (`sim.core.scheduling`) of a CPU's loops that have anything to do.
-        counters: how many pairs of patches are expired, and due, and whether the list of them does not hold: then
-            nothing is done.
-        met, boxes: all pairs of patches, of which `needed` is 0 after; where patches are.
-        blocks: elements of the patches.
-        listed: pairs of elements; `again` gets the numbers of pieces that were too short.
-        surface, rest: all nodes.
-        recovery: share of a missing distance that the substep gives back [-].
-        contacts: the list; the second number of its counter becomes the end that `listed` needs.
+        search: `met.found` has how many pairs of patches are expired, and due, and whether the list of them does not
+            hold: then nothing is done. `needed` is 0 after; the second number that contacts count becomes the end that
+            `listed` needs.
     """
+    met, blocks, listed = ti.static((search.met, search.blocks, search.listed))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     lanes, of_piece = ti.static(on_gpu(LANES), on_gpu(LANES_OF_PIECE))
     threads = ti.static(lanes * on_gpu(EDGE_PARTS))
-    holds = ti.cast(counters.found[2] == 0, ti.i32)
-    count, due_count, workers = holds * numbers[0] * counters.found[0], holds * counters.found[1], numbers[2]
+    holds = ti.cast(met.found[2] == 0, ti.i32)
+    count, due_count, workers = holds * numbers[0] * met.found[0], holds * met.found[1], numbers[2]
     enclosing = searching = ti.min(count, 1) * workers
     due_end = whole_warps(due_count * of_piece)  # then those of edges, in warps of their own
     looking = ti.min(due_count, 1) * workers
@@ -480,24 +385,24 @@ def find_near_pairs(
         looking = 2 * due_end
     if count > 0:
         listed.ends[1] = 0
-    begin_sharing(counters.taken, 0)
+    begin_sharing(met.taken, 0)
     for worker in range(enclosing):
-        item = next_item(-1, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 0, ENCLOSED_AT_A_TIME)
         while item < blocks.vertices.count * lanes + count:
             if item >= blocks.vertices.count * lanes:
                 p = met.expired[item - blocks.vertices.count * lanes]
                 listed.pieces[2 * p][2], listed.pieces[2 * p + 1][2] = 0, 0
             elif met.needed[item // lanes] == 1:
-                enclose_elements(item // lanes, item % lanes, lanes, surface.position, blocks.edges, blocks.triangles)
-            item = next_item(item, worker, counters.taken, 0, ENCLOSED_AT_A_TIME)
-    begin_sharing(counters.taken, 1)
+                enclose_elements(item // lanes, item % lanes, lanes, search.surface.position, blocks)
+            item = next_item(item, worker, met.taken, 0, ENCLOSED_AT_A_TIME)
+    begin_sharing(met.taken, 1)
     for worker in range(searching):
-        item = next_item(-1, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 1, SEARCHED_AT_A_TIME)
         while item < 2 * count * threads:
             of_all = item // threads  # first vertices with triangles of all
             piece = 2 * met.expired[of_all % count] + of_all // count
-            search_piece(piece, item % threads, met, boxes, surface, blocks, listed)
-            item = next_item(item, worker, counters.taken, 1, SEARCHED_AT_A_TIME)
+            search_piece(piece, item % threads, search)
+            item = next_item(item, worker, met.taken, 1, SEARCHED_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for k in range(count):
@@ -510,23 +415,23 @@ def find_near_pairs(
     searching_again, looking_now = ti.min(short, 1) * workers, fits * looking
     if ti.static(runs_on_gpu()):
         searching_again = short * threads
-    begin_sharing(counters.taken, 2)
+    begin_sharing(met.taken, 2)
     for worker in range(searching_again):
-        item = next_item(-1, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 2, SEARCHED_AT_A_TIME)
         while item < short * threads:
-            search_piece(listed.again[item // threads], item % threads, met, boxes, surface, blocks, listed)
-            item = next_item(item, worker, counters.taken, 2, SEARCHED_AT_A_TIME)
-    begin_sharing(counters.taken, 3)
+            search_piece(listed.again[item // threads], item % threads, search)
+            item = next_item(item, worker, met.taken, 2, SEARCHED_AT_A_TIME)
+    begin_sharing(met.taken, 3)
     for worker in range(looking_now):
-        item = next_item(-1, worker, counters.taken, 3, DUE_AT_A_TIME)
+        item = next_item(-1, worker, met.taken, 3, DUE_AT_A_TIME)
         while item < 2 * due_end:
             place = item % due_end // of_piece
             lane = ti.select(place < due_count, item % of_piece, NO_MORE)
             p = met.due[ti.min(place, due_count - 1)]
             if item < due_end:
-                look_at_piece(p, lane, of_piece, listed, met, False, surface, rest, recovery, contacts)
+                look_at_piece(p, lane, of_piece, False, search)
             else:
-                look_at_piece(p, lane, of_piece, listed, met, True, surface, rest, recovery, contacts)
-            item = next_item(item, worker, counters.taken, 3, DUE_AT_A_TIME)
+                look_at_piece(p, lane, of_piece, True, search)
+            item = next_item(item, worker, met.taken, 3, DUE_AT_A_TIME)
     listed.ends[1] = listed.ends[1] - short
-    contacts.counter[1], contacts.counter[3] = listed.ends[0], holds * fits
+    search.contacts.counter[1], search.contacts.counter[3] = listed.ends[0], holds * fits

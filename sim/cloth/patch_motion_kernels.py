@@ -5,25 +5,19 @@ launch: whether pairs may have crossed, and what of the lists is used up.
 import taichi as ti
 
 from sim.cloth.bundles import (
-    Ageing,
     BoxTree,
     Contacts,
-    Counters,
+    Followed,
     KnownPairs,
     MovingPatches,
-    PatchBounds,
-    PatchBudget,
     PatchMotion,
-    PatchNodes,
     PatchPairArrays,
-    SubstepEnd,
     TestedContacts,
-    TrackedNodes,
 )
 from sim.cloth.contact_response import thickness_between
 from sim.cloth.near_pairs import NEVER, SAFETY_OF_DUE
 from sim.cloth.proximity_contacts import EDGE_EDGE
-from sim.core.arrays import Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Share, is_finite, reduced_tree, runs_on_gpu
@@ -54,6 +48,11 @@ KEPT_MARGIN = 0.97
 LARGEST_STILL = 1.0e15
 """Differences of displacements from which on none are fitted [m]."""
 
+FEWEST_SUBSTEPS, MOST_SUBSTEPS = 12.0, 60.0
+PATCH_REACH_IN_EDGES = 3.0
+"""How many substeps' motion of the patches the list of their pairs allows for: as many as take them so many mean edges,
+but in this range. All pairs are searched when the list is made anew, and each costs a little in every substep."""
+
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
@@ -61,15 +60,12 @@ SKIN_IN_MOTIONS = 2.0
 @large_kernel
 def look_at_patches(
     vertex_count: ti.i32,
-    nodes: TrackedNodes,
     of_vertices: Share,
-    known_astray: ti.f32,
     still: ti.f32,
-    patches: MovingPatches,
-    met: PatchPairArrays,
-    ageing: Ageing,
+    followed: Followed,
+    least_skin: ti.f32,
+    first_due: Floats,
     workers: ti.math.ivec2,
-    counters: Counters,
 ) -> ti.math.ivec4:
     """Where patches are, and how they move in this substep; then, if the list of their pairs holds, which of these have
     to be searched, and of which some elements are due.
@@ -79,22 +75,21 @@ def look_at_patches(
     substep and what may come besides, is within their reach.
 
     Args:
-        vertex_count: 0 if patches have been looked at; nothing but `known_astray` is asked then.
-        nodes, of_vertices: the vertices, and how lanes share them.
-        known_astray: largest distance of a vertex from where it was left [m].
+        vertex_count, of_vertices: the vertices, and how lanes share them; 0 if patches have been looked at, and how far
+            astray any is is known.
         still: see `fit_motion`.
-        patches: get the motion.
-        met, ageing: the pairs; see `age_pair`.
+        followed: its patches get the motion, `found` the two numbers of pairs, and whether the list does not hold.
+        least_skin, first_due: see `age_pair`.
         workers: see `sim.core.scheduling`; for patches, and for their pairs.
-        counters: get the two numbers of pairs, and whether the list does not hold.
 
     Returns half the diagonal of the box of all displacements, and how far a vertex is at most from where its last
     displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
     not hold; and of how many some elements are due.
     """
-    motion, budget, tree = ti.static((patches.bounds.motion, patches.budget, of_vertices.tree))
+    nodes, patches, met = ti.static((followed.nodes, followed.patches, followed.met))
+    motion, tree = ti.static((patches.motion, of_vertices.tree))
     patches_end, pairs_end = workers[0], workers[1]
-    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
+    met.found[0], met.found[1], met.found[2] = 0, 0, 0
     for lane in range(tree.lanes):
         most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
         for k in range(of_vertices.items):
@@ -110,36 +105,35 @@ def look_at_patches(
     ends = reduced_tree(tree)
     middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
     size = ti.math.vec3(ends[0] + ends[3], ends[1] + ends[4], ends[2] + ends[5])
-    astray = ti.select(vertex_count > 0, ti.sqrt(ends[6]), known_astray)
-    begin_sharing(counters.taken, 0)
+    astray = ti.select(vertex_count > 0, ti.sqrt(ends[6]), followed.astray)
+    begin_sharing(met.taken, 0)
     for worker in range(patches_end):
-        m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+        m = next_item(-1, worker, met.taken, 0, PATCHES_AT_A_TIME)
         while m < patches.corners.count:
-            fit_motion(m, still, patches.corners, nodes, patches.bounds)
-            budget.moves[m] = (1.0 + SAFETY) * (
+            fit_motion(m, still, followed)
+            patches.moves[m] = (1.0 + SAFETY) * (
                 (motion.shift[m] - middle).norm() + motion.turn[m].norm() * motion.radius[m] + motion.rest[m]
             )
-            budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
-            if not budget.travel[m] <= budget.reach[m]:
-                counters.found[2] = 1
-            m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
-    begin_sharing(counters.taken, 1)
+            patches.travel[m] = patches.spent[m] + astray + patches.moves[m] + patches.more[m]
+            if not patches.travel[m] <= patches.reach[m]:
+                met.found[2] = 1
+            m = next_item(m, worker, met.taken, 0, PATCHES_AT_A_TIME)
+    begin_sharing(met.taken, 1)
     for worker in range(pairs_end):
-        end = ti.select(counters.found[2] == 0, met.count, 0)
-        p = next_item(-1, worker, counters.taken, 1, PAIRS_AT_A_TIME)
+        end = ti.select(met.found[2] == 0, met.count, 0)
+        p = next_item(-1, worker, met.taken, 1, PAIRS_AT_A_TIME)
         while p < end:
-            age_pair(p, met, patches, ageing, astray, counters.found)
-            p = next_item(p, worker, counters.taken, 1, PAIRS_AT_A_TIME)
-    expired = ti.select(counters.found[2] == 0, counters.found[0], -1)
-    return ti.math.ivec4(
-        ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, counters.found[1]
-    )
+            age_pair(p, followed, astray, least_skin, first_due)
+            p = next_item(p, worker, met.taken, 1, PAIRS_AT_A_TIME)
+    expired = ti.select(met.found[2] == 0, met.found[0], -1)
+    return ti.math.ivec4(ti.bit_cast(0.5 * size.norm(), ti.i32), ti.bit_cast(astray, ti.i32), expired, met.found[1])
 
 
 @func
-def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNodes, patches: PatchBounds):
+def fit_motion(m: ti.i32, still: ti.f32, followed: Followed):
     """The box and the motion of a patch; displacements within `still` [m] of each other are not fitted any closer."""
-    (motion,) = ti.static((patches.motion,))
+    nodes, corners = ti.static((followed.nodes, followed.patches.corners))
+    boxes, motion = ti.static((followed.patches.boxes, followed.patches.motion))
     first, last = corners.first[m], corners.first[m + 1]
     origin, u_first = nodes.position[corners.nodes[first]], nodes.displacement[corners.nodes[first]]
     least, most, u_least, u_most = origin, origin, u_first, u_first
@@ -155,7 +149,7 @@ def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNode
             r, v = x - origin, u - u_first
             r_sum, u_sum, moment = r_sum + r, u_sum + v, moment + r.cross(v)
             squares, products = squares + r * r, products + r * r.yzx
-    patches.low[m], patches.high[m] = least, most
+    boxes.low[m], boxes.high[m] = least, most
     x_0, u_0, w = 0.5 * (least + most), 0.5 * (u_least + u_most), ti.math.vec3(0.0)
     left, largest = (0.5 * (u_most - u_least)).norm_sqr(), (0.5 * (most - least)).norm_sqr()
     if left > still * still:
@@ -174,41 +168,27 @@ def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNode
             r = nodes.position[i] - x_0
             left = ti.max(left, (nodes.displacement[i] - u_0 - w.cross(r)).norm_sqr())
             largest = ti.max(largest, r.norm_sqr())
-    (motion.centre[m], motion.shift[m], motion.turn[m], motion.radius[m], motion.rest[m]) = (
-        x_0,
-        u_0,
-        w,
-        ti.sqrt(largest),
-        ti.sqrt(left),
-    )
+    motion.centre[m], motion.shift[m], motion.turn[m] = x_0, u_0, w
+    motion.radius[m], motion.rest[m] = ti.sqrt(largest), ti.sqrt(left)
 
 
 @kernel
-def place_leaves(
-    count: ti.i32,
-    low: Vectors,
-    high: Vectors,
-    budget: PatchBudget,
-    fewest: ti.f32,
-    most: ti.f32,
-    enough: ti.f32,
-    least: ti.f32,
-    half_thickness: ti.f32,
-    tree: BoxTree,
-):
+def place_leaves(patches: MovingPatches, edge: ti.f32, thickness: ti.f32, tree: BoxTree):
     """Leaves of a complete binary tree: boxes around the patches, then empty ones; leaf k is node `leaves` + k.
 
-    Boxes are larger than the patches by half a thickness and by as much as these may move, their `reach`: in `fewest`
-    to `most` substeps like this one, as many as take them `enough` [m], and by `least` [m] besides.
+    Boxes are larger than the patches by half a thickness and by as much as these may move, their `reach`: in
+    `FEWEST_SUBSTEPS` to `MOST_SUBSTEPS` like this one, as many as take them `PATCH_REACH_IN_EDGES`, and by half an edge
+    [m] besides.
     """
     for leaf in range(tree.leaves):
         lowest, highest = ti.math.vec3(FAR), ti.math.vec3(-FAR)
-        if leaf < count:
-            budget.spent[leaf] = 0.0
-            moves = budget.moves[leaf] + budget.change[leaf]
-            budget.reach[leaf] = ti.math.clamp(enough, fewest * moves, most * moves) + least + budget.more[leaf]
-            lowest = low[leaf] - budget.reach[leaf] - half_thickness
-            highest = high[leaf] + budget.reach[leaf] + half_thickness
+        if leaf < patches.corners.count:
+            patches.spent[leaf] = 0.0
+            moves = patches.moves[leaf] + patches.change[leaf]
+            ahead = ti.math.clamp(PATCH_REACH_IN_EDGES * edge, FEWEST_SUBSTEPS * moves, MOST_SUBSTEPS * moves)
+            patches.reach[leaf] = ahead + 0.5 * edge + patches.more[leaf]
+            lowest = patches.boxes.low[leaf] - patches.reach[leaf] - 0.5 * thickness
+            highest = patches.boxes.high[leaf] + patches.reach[leaf] + 0.5 * thickness
         tree.low[tree.leaves + leaf], tree.high[tree.leaves + leaf] = lowest, highest
 
 
@@ -247,14 +227,12 @@ def sort_known(count: ti.i32, patch_count: ti.i32, known: KnownPairs, counter: I
 def pair_patches(
     count: ti.i32,
     workers: ti.i32,
-    taken: Integers,
     tree: BoxTree,
     cloth: Integers,
     collides: Integers,
     known: KnownPairs,
     now: PatchPairArrays,
     carried: Integers,
-    counter: Integers,
     capacity: ti.i32,
 ) -> ti.i32:
     """List the patches whose boxes in the tree meet, each pair once, and each patch with itself; returns how many
@@ -262,10 +240,10 @@ def pair_patches(
 
     What was known before about a pair holds (`sort_known`): `carried` is its number there, or -1.
     """
-    counter[0] = 0
-    begin_sharing(taken, 0)
+    now.found[0] = 0
+    begin_sharing(now.taken, 0)
     for worker in range(workers):
-        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        m = next_item(-1, worker, now.taken, 0, PATCHES_AT_A_TIME)
         while m < count:
             least, most = tree.low[tree.leaves + m], tree.high[tree.leaves + m]
             node = 1
@@ -280,15 +258,15 @@ def pair_patches(
                 else:
                     other = node - tree.leaves
                     if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
-                        slot = ti.atomic_add(counter[0], 1)
+                        slot = ti.atomic_add(now.found[0], 1)
                         if slot < capacity:
                             now.pairs[slot] = ti.Vector([m, other])
                     # On to the next node that is not below this one; 0 after the last.
                     while node % 2 == 1:
                         node = node // 2
                     node += ti.cast(node > 0, ti.i32)
-            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
-    end = ti.min(counter[0], capacity)
+            m = next_item(m, worker, now.taken, 0, PATCHES_AT_A_TIME)
+    end = ti.min(now.found[0], capacity)
     for p in range(end):
         m, other, before = now.pairs[p][0], now.pairs[p][1], -1
         for place in range(known.first[2 * m], known.first[2 * m + 1]):
@@ -298,14 +276,7 @@ def pair_patches(
         if before >= 0:
             now.slack[p] = known.slack[before]
         now.wake[p], now.left[p], now.approach[p], now.allowed[p] = -1.0, FAR, 0.0, 0.0
-    return counter[0]
-
-
-@ti.func
-def gap_of_boxes(m: ti.i32, other: ti.i32, low: Vectors, high: Vectors) -> ti.f32:
-    """Distance of two patches' boxes [m]."""
-    between = ti.max(low[m] - high[other], low[other] - high[m], 0.0)
-    return between.norm()
+    return now.found[0]
 
 
 @func
@@ -318,116 +289,94 @@ def approach_of(m: ti.i32, other: ti.i32, motion: PatchMotion) -> ti.f32:
     between = motion.centre[other] - motion.centre[m]
     turned = (motion.turn[other] - motion.turn[m]).norm() * motion.radius[other] if m != other else 0.0
     shifted = (motion.shift[other] - motion.shift[m] - motion.turn[m].cross(between)).norm() if m != other else 0.0
-    return (
-        motion.rest[m]
-        + motion.rest[other]
-        + turned
-        + shifted
-        + SAFETY * (motion.rest[m] + motion.rest[other] + turned + shifted)
-    )
+    nearer = motion.rest[m] + motion.rest[other] + turned + shifted
+    return nearer + SAFETY * nearer
 
 
 @func
-def age_pair(
-    p: ti.i32, met: PatchPairArrays, patches: MovingPatches, ageing: Ageing, astray: ti.f32, counter: Integers
-):
+def age_pair(p: ti.i32, followed: Followed, astray: ti.f32, least_skin: ti.f32, first_due: Floats):
     """List a pair of patches if its elements have to be searched before this substep, and if some of them are due.
 
     Pairs far apart sleep until their patches' motion can have closed the gap between their boxes.
 
     Args:
         p: number of the pair.
-        met: the pairs, with `slack`: how much nearer elements that are not listed may come, and be a thickness apart;
-            and `left`: what of it elements that are listed may use up until they are looked at: one that was d apart
-            when the slack was s is due when `left` is below s - d. `needed` gets 1 for patches of pairs that are
+        followed: the pairs, with `slack`: how much nearer elements that are not listed may come, and be a thickness
+            apart; and `left`: what of it elements that are listed may use up until they are looked at: one that was d
+            apart when the slack was s is due when `left` is below s - d. `needed` gets 1 for patches of pairs that are
             searched.
-        patches: their motion in this substep.
-        ageing: how far to search; what is due of both lists is `NEVER` after this where a pair is due, as those that
-            are looked at get other numbers.
         astray: largest distance of a vertex from where it was left [m].
-        counter: of both lists.
+        least_skin: how far beyond the thickness to search at least [m].
+        first_due: `PairPieces.piece_due`, which is `NEVER` after this where a pair is due, as elements that are looked
+            at get other numbers.
     """
-    (budget,) = ti.static((patches.budget,))
-    thickness = ageing.thickness
+    met, patches, counter = ti.static((followed.met, followed.patches, followed.met.found))
+    thickness = followed.thickness
     m, other = met.pairs[p][0], met.pairs[p][1]
-    if budget.travel[m] + budget.travel[other] > met.wake[p]:
-        whole, besides = (budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other])
-        nearer = ti.min(approach_of(m, other, patches.bounds.motion), whole)
-        met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
+    if patches.travel[m] + patches.travel[other] > met.wake[p]:
+        whole, besides = (patches.moves[m] + patches.moves[other], patches.more[m] + patches.more[other])
+        nearer = ti.min(approach_of(m, other, patches.motion), whole)
+        met.approach[p], met.allowed[p] = nearer, patches.margin[m] + patches.margin[other]
         met.slack[p] -= 2.0 * astray
         is_searched = False
         if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
-            gap = gap_of_boxes(m, other, patches.bounds.low, patches.bounds.high) - (1.0 + SAFETY_OF_DUE) * thickness
+            low, high = ti.static((patches.boxes.low, patches.boxes.high))
+            gap = ti.max(low[m] - high[other], low[other] - high[m], 0.0).norm() - (1.0 + SAFETY_OF_DUE) * thickness
             if gap > whole + besides:
-                met.wake[p], met.slack[p] = (budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0)
+                met.wake[p], met.slack[p] = (patches.spent[m] + patches.spent[other] + 2.0 * astray + gap, -1.0)
                 met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
             else:
-                skin = ti.max(ageing.least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
+                skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
                 met.wake[p], met.slack[p], met.reach[p] = -1.0, skin, thickness + skin
                 is_searched = True
                 met.expired[ti.atomic_add(counter[0], 1)] = p
                 met.needed[m], met.needed[other] = 1, 1
         if met.wake[p] < 0.0:
             met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
-            if is_searched or ti.max(ageing.first_due[2 * p], ageing.first_due[2 * p + 1]) >= met.left[p]:
+            if is_searched or ti.max(first_due[2 * p], first_due[2 * p + 1]) >= met.left[p]:
                 met.due[ti.atomic_add(counter[1], 1)] = p
-                ageing.first_due[2 * p], ageing.first_due[2 * p + 1] = NEVER, NEVER
+                first_due[2 * p], first_due[2 * p + 1] = NEVER, NEVER
 
 
 @func
-def measure_change(
-    m: ti.i32,
-    patches: MovingPatches,
-    displacement: Vectors,
-    predicted: Vectors,
-    half_thickness: ti.f32,
-    counter: Integers,
-):
+def measure_change(m: ti.i32, followed: Followed, predicted: Vectors):
     """How far contacts displaced the vertices of a patch at most, `change` [m]; where that is beyond the `margin` that
     was allowed for, half as much again is from now on.
 
-    The second number of `counter` becomes 1 where it is beyond, and the third where it is not finite.
+    The second number that is counted becomes 1 where it is beyond, and the third where it is not finite.
     """
-    corners, budget = ti.static((patches.corners, patches.budget))
+    nodes, patches, counter = ti.static((followed.nodes, followed.patches, followed.met.found))
+    (corners,) = ti.static((patches.corners,))
     squared = 0.0
     for place in range(corners.first[m], corners.first[m + 1]):
         i = corners.nodes[place]
-        squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
-    budget.change[m] = ti.sqrt(squared)
-    if budget.change[m] > budget.margin[m]:
-        budget.margin[m] = 1.5 * budget.change[m]
-        budget.more[m] = budget.margin[m] - half_thickness
+        squared = ti.max(squared, (nodes.displacement[i] - predicted[i]).norm_sqr())
+    patches.change[m] = ti.sqrt(squared)
+    if patches.change[m] > patches.margin[m]:
+        patches.margin[m] = 1.5 * patches.change[m]
+        patches.more[m] = patches.margin[m] - 0.5 * followed.thickness
         counter[1] = 1
     if is_finite(squared) == 0:
         counter[2] = 1
 
 
-@ti.func
-def margin_after(is_changed: ti.i32, change: ti.f32, margin: ti.f32, least: ti.f32) -> ti.f32:
-    """How far contacts may displace a patch in the next substep without it being looked at anew [m].
-
-    `WIDENED` times what they did in this one, `KEPT_MARGIN` times what they might have, and `least` at least; only that
-    where they did nothing to any patch.
+@func
+def finish_patch(m: ti.i32, is_changed: ti.i32, followed: Followed):
+    """What a patch used up of the lists in a substep; and how far contacts may displace it in the next one without it
+    being looked at anew: `WIDENED` times what they did in this one, `KEPT_MARGIN` times what they might have, and half
+    a thickness at least; only that where they did nothing to any patch.
     """
-    return ti.max(least, ti.select(is_changed == 1, ti.max(WIDENED * change, KEPT_MARGIN * margin), 0.0))
-
-
-@func
-def finish_patch(m: ti.i32, patches: MovingPatches, end: SubstepEnd):
-    """What a patch used up of the lists in a substep, and its margin for the next one."""
-    (budget,) = ti.static((patches.budget,))
-    margin, change = budget.margin[m], ti.select(end.is_changed == 1, budget.change[m], 0.0)
-    budget.change[m] = change
-    budget.spent[m] += budget.moves[m] + change + end.astray
-    budget.margin[m] = margin_after(end.is_changed, change, margin, end.least_margin)
-    budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
-
-
-@func
-def finish_pair(p: ti.i32, met: PatchPairArrays, budget: PatchBudget):
-    """The same of a pair of patches."""
-    if met.slack[p] > 0.0:
-        met.slack[p] -= met.approach[p] + budget.change[met.pairs[p][0]] + budget.change[met.pairs[p][1]]
+    (patches,) = ti.static((followed.patches,))
+    margin, change, least = (
+        patches.margin[m],
+        ti.select(is_changed == 1, patches.change[m], 0.0),
+        0.5 * followed.thickness,
+    )
+    patches.change[m] = change
+    patches.spent[m] += patches.moves[m] + change + followed.astray
+    wide = ti.select(is_changed == 1, ti.max(WIDENED * change, KEPT_MARGIN * margin), 0.0)
+    patches.margin[m] = ti.max(least, wide)
+    patches.more[m] = ti.max(patches.margin[m] - least, 0.0)
 
 
 LARGEST_SHARE = 0.9
@@ -444,7 +393,7 @@ ROUNDING = 1.0e-6
 
 
 @func
-def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, nodes: TrackedNodes, counter: Integers):
+def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, followed: Followed):
     """Count a pair if it is not certainly apart all through the substep, and have its worst vertices pushed.
 
     Two sides that a plane across n separates at the start, and one across n at the end, are separated all the time in
@@ -452,6 +401,7 @@ def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, nodes
     of the nearest two vertices, keeps 1 - `LARGEST_SHARE` of what it was; or all of it where it was none.
     `crossing` gets 1 for pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
     """
+    (nodes,) = ti.static((followed.nodes,))
     tested.crossing[c] = 0
     mobile = 0.0
     for k in ti.static(range(4)):
@@ -460,8 +410,7 @@ def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, nodes
         n, v = contacts.normal[c], contacts.vertices[c]
         first = ti.select(contacts.kind[c] == EDGE_EDGE, 2, 1)
         origin, size = nodes.position[v[0]], 0.0
-        start = ti.math.vec4(0.0)
-        end = ti.math.vec4(0.0)
+        start, end = ti.math.vec4(0.0), ti.math.vec4(0.0)
         for k in ti.static(range(4)):
             x = nodes.position[v[k]] - origin
             start[k] = n.dot(x)
@@ -482,7 +431,7 @@ def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, nodes
         least_gap = LEAST_GAP * thickness_between(v, tested.thickness)
         least = ti.min(ti.max((1.0 - LARGEST_SHARE) * apart, least_gap), apart - ROUNDING * size)
         if low - high < least:
-            ti.atomic_add(counter[0], 1)
+            ti.atomic_add(followed.met.found[0], 1)
             tested.crossing[c] = 1
             pair = ti.math.vec4(0.0)
             between = 0.0
@@ -502,56 +451,55 @@ def end_contacts(
     contacts: Contacts,
     tested: TestedContacts,
     vertex_count: ti.i32,
-    nodes: TrackedNodes,
     predicted: Vectors,
-    patches: MovingPatches,
-    end: SubstepEnd,
-    met: PatchPairArrays,
+    is_changed: ti.i32,
+    followed: Followed,
     workers: ti.math.ivec3,
-    counters: Counters,
 ) -> ti.math.ivec3:
     """Test `count` contacts (`repair_crossing`); if none failed, measure how far they displaced patches; if not farther
     than allowed for, displacements are final: note where they lead, and what of the lists they use up.
 
     Args:
         count, contacts, tested: see `repair_crossing`.
-        vertex_count, nodes: the vertices.
+        vertex_count: number of vertices.
         predicted: displacements as contacts were looked for [m].
-        patches, end, met: see `finish_patch` and `finish_pair`.
+        is_changed: whether contacts displaced anything.
+        followed: the patches and their pairs; `found` gets three numbers.
         workers: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
-        counters: three numbers.
 
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
     is not finite.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    nodes, patches, met = ti.static((followed.nodes, followed.patches, followed.met))
     contacts_end, vertices_end = count, vertex_count
     displaced_end, patches_end, pairs_end = workers[0], workers[1], workers[2]
-    counters.found[0], counters.found[1], counters.found[2] = 0, 0, 0
+    met.found[0], met.found[1], met.found[2] = 0, 0, 0
     for c in range(contacts_end):
-        repair_crossing(c, contacts, tested, nodes, counters.found)
-    begin_sharing(counters.taken, 0)
+        repair_crossing(c, contacts, tested, followed)
+    begin_sharing(met.taken, 0)
     for worker in range(displaced_end):
-        stop = ti.select(counters.found[0] == 0, patches.corners.count, 0)
-        m = next_item(-1, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+        stop = ti.select(met.found[0] == 0, patches.corners.count, 0)
+        m = next_item(-1, worker, met.taken, 0, PATCHES_AT_A_TIME)
         while m < stop:
-            measure_change(m, patches, nodes.displacement, predicted, end.half_thickness, counters.found)
-            m = next_item(m, worker, counters.taken, 0, PATCHES_AT_A_TIME)
+            measure_change(m, followed, predicted)
+            m = next_item(m, worker, met.taken, 0, PATCHES_AT_A_TIME)
     for i in range(vertices_end):
-        if counters.found[0] + counters.found[1] + counters.found[2] == 0:
+        if met.found[0] + met.found[1] + met.found[2] == 0:
             nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
-    begin_sharing(counters.taken, 1)
+    begin_sharing(met.taken, 1)
     for worker in range(patches_end):
-        stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, patches.corners.count, 0)
-        m = next_item(-1, worker, counters.taken, 1, PATCHES_AT_A_TIME)
+        stop = ti.select(met.found[0] + met.found[1] + met.found[2] == 0, patches.corners.count, 0)
+        m = next_item(-1, worker, met.taken, 1, PATCHES_AT_A_TIME)
         while m < stop:
-            finish_patch(m, patches, end)
-            m = next_item(m, worker, counters.taken, 1, PATCHES_AT_A_TIME)
-    begin_sharing(counters.taken, 2)
+            finish_patch(m, is_changed, followed)
+            m = next_item(m, worker, met.taken, 1, PATCHES_AT_A_TIME)
+    begin_sharing(met.taken, 2)
     for worker in range(pairs_end):
-        stop = ti.select(counters.found[0] + counters.found[1] + counters.found[2] == 0, met.count, 0)
-        p = next_item(-1, worker, counters.taken, 2, PAIRS_AT_A_TIME)
+        stop = ti.select(met.found[0] + met.found[1] + met.found[2] == 0, met.count, 0)
+        p = next_item(-1, worker, met.taken, 2, PAIRS_AT_A_TIME)
         while p < stop:
-            finish_pair(p, met, patches.budget)
-            p = next_item(p, worker, counters.taken, 2, PAIRS_AT_A_TIME)
-    return ti.math.ivec3(counters.found[0], counters.found[1], counters.found[2])
+            if met.slack[p] > 0.0:
+                met.slack[p] -= met.approach[p] + patches.change[met.pairs[p][0]] + patches.change[met.pairs[p][1]]
+            p = next_item(p, worker, met.taken, 2, PAIRS_AT_A_TIME)
+    return ti.math.ivec3(met.found[0], met.found[1], met.found[2])

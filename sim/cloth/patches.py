@@ -36,10 +36,8 @@ class Patches:
         count: number of patches, m.
         vertex_count: of all patches, n.
         leaves: m rounded up to a power of two.
-        first_triangle, first_edge, first_vertex: of each patch, (m + 1,).
-        triangles: in the order of the patches, (k,) ivec3 of vertices; edges (e,) ivec2; vertices (n,).
-        first_corner, corners: all vertices of a patch's triangles, which its edges end at, its own and others, (c,).
-        corner_lists, vertex_lists, lists: these for kernels.
+        lists: elements in the order of the patches.
+        corners: all vertices of each patch's triangles, which its edges end at, its own and others.
         cloth: of each patch, (m,).
 
     Args:
@@ -52,28 +50,20 @@ class Patches:
         self.count = int(patch.max()) + 1 if len(patch) else 0
         self.vertex_count = len(host.position)
         self.leaves = 1 << max(self.count - 1, 0).bit_length()
-        order = np.argsort(patch, kind="stable")
-        self.first_triangle = on_device(_starts(patch, self.count))
-        self.triangles = on_device(triangles[order])
-
+        order, first_triangle = np.argsort(patch, kind="stable"), _starts(patch, self.count)
         corner_patch, corner = np.unique(np.stack([np.repeat(patch, 3), triangles.ravel()]), axis=1)
-        self.first_corner, self.corners = on_device(_starts(corner_patch, self.count)), on_device(corner)
+        self.corners = PatchNodes(self.count, on_device(_starts(corner_patch, self.count)), on_device(corner))
         # The first patch that a vertex is a corner of owns it, and so an edge: the first with both of its ends in a
         # triangle, as edges are sides of triangles.
         owner = np.full(len(host.position), self.count)
         np.minimum.at(owner, corner, corner_patch)
-        self.first_vertex = on_device(_starts(np.sort(owner), self.count))
-        self.vertices = on_device(np.argsort(owner, kind="stable"))
-
+        own = on_device(_starts(np.sort(owner), self.count)), on_device(np.argsort(owner, kind="stable"))
         edge_owner = np.full(len(edges), self.count)
         np.minimum.at(edge_owner, host.edges.of_side, np.repeat(patch, 3))
-        self.first_edge = on_device(_starts(np.sort(edge_owner), self.count))
-        self.edges = on_device(edges[np.argsort(edge_owner, kind="stable")])
-        self.cloth = on_device(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
-        self.corner_lists = PatchNodes(self.count, self.first_corner, self.corners)
-        self.vertex_lists = PatchNodes(self.count, self.first_vertex, self.vertices)
-        elements = self.first_edge, self.edges, self.first_triangle, self.triangles
-        self.lists = PatchLists(self.vertex_lists, *elements)
+        first_edge, in_order = _starts(np.sort(edge_owner), self.count), np.argsort(edge_owner, kind="stable")
+        elements = first_edge, edges[in_order], first_triangle, triangles[order]
+        self.lists = PatchLists(PatchNodes(self.count, *own), *map(on_device, elements))
+        self.cloth = on_device(host.body[triangles[order[first_triangle[:-1]], 0]])
 
 
 def _patch_of_triangles(host: HostCloths) -> NDArray[np.int64]:
@@ -110,10 +100,9 @@ def blocks_of(patches: Patches) -> PatchBlocks:
     One array for each component, and blocks of a length that the compiler knows: so it compares eight elements in an
     instruction, where it took one after another from arrays of vectors. `NONE` is in places that only fill up.
     """
-    triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
-    return PatchBlocks(
-        patches.vertex_lists, triangles, EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
-    )
+    lists, count = patches.lists, patches.count
+    triangles = TriangleBlocks(*_blocks(lists.triangles, lists.first_triangle, count))
+    return PatchBlocks(lists.vertices, triangles, EdgeBlocks(*_blocks(lists.edges, lists.first_edge, count)))
 
 
 def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:

@@ -59,10 +59,6 @@ class Pin:
             self._take(self.nodes[kept], self._host_arm[kept])
         return True
 
-    def holds(self, time_s: float) -> bool:
-        """Whether it holds its nodes at a simulated time [s]."""
-        return holds(self.release_s, time_s)
-
     def displace(self, state: ClothState, time_s: float, dt: float) -> None:
         """Move its nodes from where they are at a time [s] to where they will be dt later."""
         if self.path is None:
@@ -110,7 +106,7 @@ class Pins:
 
     def hold(self, time_s: float) -> bool:
         """Hold what is pinned at a simulated time [s]; returns whether that differs from before."""
-        held = tuple(pin.holds(time_s) for pin in self._pins)
+        held = tuple(holds(pin.release_s, time_s) for pin in self._pins)
         if held == self._held:
             return False
         self._held = held
@@ -120,8 +116,8 @@ class Pins:
     def hold_anew(self) -> None:
         """Hold the same nodes as before, after their masses changed."""
         is_pinned = np.zeros(self._state.vertex_count, dtype=bool)
-        for pin, holds in zip(self._pins, self._held or (), strict=True):
-            if holds:
+        for pin, is_held in zip(self._pins, self._held or (), strict=True):
+            if is_held:
                 is_pinned[pin.nodes] = True
         self._state.set_pinned(is_pinned)
 
@@ -154,6 +150,6 @@ class Pins:
 
     def displace(self, time_s: float, dt: float) -> None:
         """Move the nodes of pins that hold, from a time [s] on, for dt."""
-        for pin, holds in zip(self._pins, self._held or (), strict=True):
-            if holds:
+        for pin, is_held in zip(self._pins, self._held or (), strict=True):
+            if is_held:
                 pin.displace(self._state, time_s, dt)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import (
     CollidingBodies,
     Four,
+    MovingPatches,
     PatchLists,
     PatchMotion,
     PushedBodies,
@@ -41,55 +42,6 @@ Array = NDArray[np.float64]
 LOAD_UNIT = 1.0e-6  # unit of sums of the square roots of mobilities, in the largest of them
 
 _ROUND = (SPHERE, CAPSULE, TORUS)
-
-
-class CollisionBodies(DeviceShapes):
-    """All bodies that cloth may touch: those that move, then those that stand still.
-
-    Attributes:
-        colliding: the bodies for kernels that find contacts.
-        pushed: the bodies for kernels that push them.
-
-    Args:
-        geometries: of the bodies.
-        friction: Coulomb's coefficients [-], (b,).
-        cloths: number of cloths.
-    """
-
-    def __init__(self, geometries: Sequence[BodyGeometry], friction: Sequence[float], cloths: int = 1) -> None:
-        super().__init__(geometries)
-        b = self.count
-        known = {name: getattr(self, name) for name in ("centre_of_mass", "radius", "step")}
-        motion = ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1))
-        self.colliding: CollidingBodies = with_room(
-            CollidingBodies,
-            b,
-            count=b,
-            shapes=self.on_device,
-            motion=motion,
-            passes=ti.ndarray(ti.i32, max(b * cloths, 1)),
-            **known,
-        )
-        twice = {name: ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1)) for name in ("motion_start", "motion_reached")}
-        six = {name: ti.ndarray(ti.i64, 6 * max(b, 1)) for name in ("gathered", "impulse")}
-        self.pushed: PushedBodies = with_room(
-            PushedBodies, b, may_move=0, count=b, motion=motion, load_unit=1.0, **twice, **six
-        )
-        self.set_friction(np.asarray(friction, dtype=np.float64))
-
-    def set_passing(self, passing: NDArray[np.bool_]) -> None:
-        """Say which cloths pass through which bodies, (cloths, b)."""
-        if self.count:
-            put(self.colliding.passes, passing.ravel())
-
-    def begin_frame(self) -> None:
-        """Note anew how deep cloth gets."""
-        self.colliding.depth.fill(0.0)
-
-    def set_friction(self, friction: Array) -> None:
-        """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""
-        if self.count:
-            put(self.colliding.friction, friction)
 
 
 LANES_OF_VERTICES = 8  # threads of a GPU for a patch of which vertices alone are looked at
@@ -146,14 +98,18 @@ class BodyMotion:
     inverse_inertia: Array
 
 
-class RigidContact:
-    """Finds where cloth touches bodies and walls.
+class RigidContact(DeviceShapes):
+    """Finds where cloth touches bodies and walls: bodies that move, then those that stand still.
 
     Cloth stays half its thickness away from both. Its vertices are looked at, which keep a little more where a round
     body would show a little between them (`CollidingBodies.lift`); and where it may show more, as it is sharp, small or
     thinly covered, the deepest point of each triangle.
     The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
     by less than `LARGEST_ADVANCE` (`stable_dt`).
+
+    Attributes:
+        colliding: the bodies for kernels that find contacts.
+        pushed: the bodies for kernels that push them.
 
     Args:
         geometries: of the bodies; those that move first.
@@ -165,7 +121,26 @@ class RigidContact:
     def __init__(
         self, geometries: Sequence[BodyGeometry], friction: Sequence[float], walls: Sequence[Wall], cloths: int = 1
     ) -> None:
-        self.bodies = CollisionBodies(geometries, friction, cloths)
+        super().__init__(geometries)
+        b = self.count
+        motion = ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1))
+        self.colliding: CollidingBodies = with_room(
+            CollidingBodies,
+            b,
+            count=b,
+            shapes=self.on_device,
+            centre_of_mass=self.centre_of_mass,
+            radius=self.radius,
+            step=self.step,
+            motion=motion,
+            passes=ti.ndarray(ti.i32, max(b * cloths, 1)),
+        )
+        twice = {name: ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1)) for name in ("motion_start", "motion_reached")}
+        six = {name: ti.ndarray(ti.i64, 6 * max(b, 1)) for name in ("gathered", "impulse")}
+        self.pushed: PushedBodies = with_room(
+            PushedBodies, b, may_move=0, count=b, motion=motion, load_unit=1.0, **twice, **six
+        )
+        self.set_friction(np.asarray(friction, dtype=np.float64))
         self._motion: BodyMotion | None = None
         self._time_s = 0.0
         self._advance = LARGEST_ADVANCE * 0.5 * np.array([geometry.shortest_edge for geometry in geometries])
@@ -191,13 +166,23 @@ class RigidContact:
         arrays = (on_device(each) for each in (planes, low, high, joined[1.0], joined[-1.0]))
         self._walls = Walls(len(walls), 0.0, *arrays)
 
+    def set_passing(self, passing: NDArray[np.bool_]) -> None:
+        """Say which cloths pass through which bodies, (cloths, b)."""
+        if self.count:
+            put(self.colliding.passes, passing.ravel())
+
+    def set_friction(self, friction: Array) -> None:
+        """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""
+        if self.count:
+            put(self.colliding.friction, friction)
+
     def set_spacing(self, mean_edge: float, longest: float) -> None:
         """Say how long edges of the coarsest cloth are, and the longest of all [m]."""
         self._walls, self._longest = self._walls._replace(spacing=mean_edge), longest
 
     def set_thickness(self, least: float, largest: float) -> None:
         """Say how thick cloths are at least and at most [m]: where they can be bodies may show between vertices."""
-        b, shapes, colliding = self.bodies.count, self.bodies.on_device, self.bodies.colliding
+        b, shapes, colliding = self.count, self.on_device, self.colliding
         size, kind = (copied(each)[:b] for each in (shapes.size, shapes.kind))
         radius = np.where(kind == TORUS, size[:, 1], size[:, 0])
         # How far it shows at most through triangles whose vertices touch it; what is sharp, or a grid, by any height.
@@ -215,7 +200,7 @@ class RigidContact:
     def place(self, poses: Poses, motion: BodyMotion | None = None, time_s: float = 0.0) -> None:
         """Say where the bodies are at the start of a substep, at a time [s], and how they move; without motion they
         stand still."""
-        b, self._time_s = self.bodies.count, time_s
+        b, self._time_s = self.count, time_s
         inverse_mass, inverse_inertia = np.zeros(b), np.zeros((b, 3, 3))
         self._velocity, self._spin_speed = np.zeros((b, 3)), np.zeros(b)
         self._motion = motion
@@ -224,17 +209,17 @@ class RigidContact:
             inverse_mass[:m], inverse_inertia[:m] = motion.inverse_mass, motion.inverse_inertia
             self._velocity[:m] = motion.velocity
             self._spin_speed[:m] = self._radius[:m] * np.linalg.norm(motion.angular_velocity, axis=1)
-            for number, geometry in enumerate(self.bodies.geometries[:m]):
+            for number, geometry in enumerate(self.geometries[:m]):
                 if geometry.deformation is not None:
                     self._spin_speed[number] += geometry.deformation.speed(time_s)
         if b:
-            colliding, pushed = self.bodies.colliding, self.bodies.pushed
+            colliding, pushed = self.colliding, self.pushed
             put(colliding.position, poses.position[:b])
             put(colliding.rotation, poses.rotation[:b])
             put(pushed.inverse_mass, inverse_mass)
             put(pushed.inverse_inertia, inverse_inertia)
             mobility = inverse_mass + self._radius**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
-            self.bodies.pushed = pushed._replace(
+            self.pushed = pushed._replace(
                 may_move=int(pushed.may_move or inverse_mass.any()),
                 load_unit=LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0,
             )
@@ -242,14 +227,14 @@ class RigidContact:
     def begin_substep(self, dt: float) -> None:
         """Foresee how the bodies move in a substep of dt [s] that cloth does not push."""
         if self._motion is not None:
-            b, motion = self.bodies.count, self._motion
+            b, motion = self.count, self._motion
             m = len(motion.velocity)
             shift, turn = np.zeros((b, 3)), np.zeros((b, 3))
             shift[:m] = dt * (motion.velocity + dt * motion.acceleration)
             turn[:m] = dt * motion.angular_velocity
             if b:
-                put(self.bodies.colliding.motion, np.stack([shift, turn], axis=1).reshape(-1, 3))
-            self.bodies.deform(self._time_s, dt)
+                put(self.colliding.motion, np.stack([shift, turn], axis=1).reshape(-1, 3))
+            self.deform(self._time_s, dt)
 
     def stable_dt(self, state: ClothState, nodes: range, box: Box, *, at_most: float) -> float:
         """Largest step [s] for some nodes, of one cloth or of several.
@@ -263,7 +248,7 @@ class RigidContact:
                 one where all of them as fast as any and near the bodies would need shorter steps.
             at_most: the largest step otherwise [s].
         """
-        if not self.bodies.count:
+        if not self.count:
             return at_most
         speed = np.linalg.norm(np.abs(box[0]) + box[1])
         rates = (speed + np.linalg.norm(self._velocity, axis=1) + self._spin_speed) / self._advance
@@ -277,7 +262,7 @@ class RigidContact:
             len(nodes),
             state.position,
             state.velocity,
-            self.bodies.colliding,
+            self.colliding,
             self._moving,
             self._advance_on_device,
             self._largest_half + self._longest / math.sqrt(3.0),  # a triangle's middle is no farther from a node
@@ -285,13 +270,7 @@ class RigidContact:
         return min(at_most, 1.0 / max(float(rate), 1.0e-30))
 
     def find(
-        self,
-        state: ClothState,
-        patches: Patches,
-        motion: PatchMotion,
-        margin: ti.Ndarray,
-        contacts: ContactList,
-        recovery: float,
+        self, state: ClothState, patches: Patches, moving: MovingPatches, contacts: ContactList, recovery: float
     ) -> Callable[[], list[int]]:
         """Append what touches in this substep. Asks for the numbers of the list's counter, the first of which is how
         many contacts were found in all; that is 0 from then on.
@@ -299,30 +278,22 @@ class RigidContact:
         Args:
             state: at the start of a substep.
             patches: of the cloths.
-            motion: of them in it.
-            margin: how far contacts may displace each [m].
+            moving: how they move in it, and how far contacts may displace each.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
-        is_alone, shows = not (self._walls.count or self.bodies.count), self._shows.any()
+        is_alone, shows = not (self._walls.count or self.count), self._shows.any()
         lanes = on_gpu(LANES if shows else LANES_OF_VERTICES)
+        cloth = state.surface, state.inverse_mass, state.body
         return find_rigid_contacts.later(
             patches.lists,
             (lanes, 0 if is_alone else workers_for(patches.count * lanes)),
             self._taken,
-            motion,
-            margin,
+            moving.motion,
+            moving.margin,
             self._largest_half,
-            Touching(
-                state.surface,
-                state.inverse_mass,
-                state.body,
-                self._walls,
-                self.bodies.colliding,
-                recovery,
-                contacts.found,
-            ),
-            SHOWN_BODIES if shows else BODIES if self.bodies.count else NO_BODIES,
+            Touching(*cloth, self._walls, self.colliding, recovery, contacts.found),
+            SHOWN_BODIES if shows else BODIES if self.count else NO_BODIES,
         )
 
 

@@ -1,4 +1,6 @@
-"""Cloth against cloth: which elements may meet, kept in a list for as long as motion allows."""
+"""Cloth against cloth: which elements may meet, kept in lists that are searched anew where and when motion has used
+them up.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,36 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.bundles import Ageing, Boxes, Counters, Rest
-from sim.cloth.near_pairs import find_near_pairs, range_of_vectors
-from sim.cloth.patch_pairs import PairList, PatchPairs
+from sim.cloth.bundles import (
+    Boxes,
+    BoxTree,
+    Followed,
+    Four,
+    KnownPairs,
+    MovingPatches,
+    PairPieces,
+    PairSearch,
+    PatchMotion,
+    PatchPairArrays,
+    Rest,
+    TestedContacts,
+    TrackedNodes,
+    Two,
+)
+from sim.cloth.near_pairs import NEVER, carry_pieces, find_near_pairs, keep_pairs, range_of_vectors
+from sim.cloth.patch_motion_kernels import (
+    LARGEST_STILL,
+    end_contacts,
+    look_at_patches,
+    merge_boxes,
+    pair_patches,
+    place_leaves,
+    sort_known,
+)
 from sim.cloth.patches import Patches, blocks_of
-from sim.cloth.proximity_contacts import ContactList
+from sim.cloth.proximity_contacts import GROWTH, ContactList
 from sim.core.arrays import on_device
+from sim.core.bundles import with_room
 from sim.core.host_access import copied
 from sim.core.reductions import LaneReduction
 from sim.core.scheduling import workers_for
@@ -30,6 +56,93 @@ LEAST_SKIN_IN_EDGES = 0.15
 """How far lists of pairs reach, and at least farther than the thickness, in mean edges, if motion does not ask for
 more: to last for many substeps at rest, but not list most neighbours in flat cloth, 0.9 mean edges and more off."""
 
+MARGIN = 0.5
+"""How far contacts are expected to push, in thicknesses; where they push farther, pairs are looked at again."""
+
+STILL = 1.0e-3
+"""Part of the thickness by which displacements of a patch may differ without a turn being fitted to them: a list lasts
+for a hundred substeps even so, and cloth that falls or lies is looked at once instead of twice."""
+
+MAX_PAIRS = 2**28
+"""Most pairs of a list: 6 GiB on the device, and as much again while they are carried over. So many mean that the step
+is far too large."""
+
+TOO_MANY = f"more than {MAX_PAIRS} pairs of cloth elements are near each other; lower the step"
+
+
+class PairList:
+    """Pairs of elements, those of each pair of patches in pieces of their own; grows when it must.
+
+    Attributes:
+        on_device: the list for kernels.
+        capacity: places of pairs.
+
+    Args:
+        capacity: pairs of elements to start with.
+        met: pairs of patches.
+    """
+
+    def __init__(self, *, capacity: int, met: int) -> None:
+        ends, self._taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 1)
+        self.capacity = capacity
+        self.on_device = PairPieces(ends=ends, **_pieces(met), **_places(capacity))
+        self._spare = PairPieces(ends=ends, **_pieces(met), **_places(1))
+
+    def set_pieces(self, met: int) -> None:
+        """Make room for the pieces of so many pairs of patches, all empty."""
+        self.on_device.ends.fill(0)
+        self.on_device, self._spare = (each._replace(**_pieces(met)) for each in (self.on_device, self._spare))
+
+    def carry(self, count: int, carried: ti.Ndarray, met: int) -> None:
+        """Follow pairs of patches to their new numbers, with their pieces.
+
+        Args:
+            count: how many there are now.
+            carried: their numbers before, or -1, (count,).
+            met: most of them.
+        """
+        # Two sets of arrays in turn: new ones would have all launches prepared anew.
+        before, now = self.on_device, self._spare
+        if now.pieces.shape[0] < 2 * met:
+            now = now._replace(**_pieces(met))
+        if now.pairs.shape[0] < self.capacity:
+            now = now._replace(**_places(self.capacity))
+        self.on_device, self._spare = now, before
+        carry_pieces(2 * count, workers_for(count), self._taken, carried, before, now)
+
+    def reach_to(self, end: int) -> bool:
+        """Whether pieces up to this place did not fit, so that their search has to go on; now there is room, and what
+        was listed is kept.
+
+        Raises:
+            OverflowError: more pairs than any useful step has.
+        """
+        if not 0 <= end <= MAX_PAIRS:
+            raise OverflowError(TOO_MANY)
+        if end <= self.capacity:
+            return False
+        self.resize(int(GROWTH * end))
+        return True
+
+    def resize(self, capacity: int) -> None:
+        """Have so many places, with what they hold."""
+        kept, before = min(self.capacity, capacity), self.on_device
+        self.capacity, self.on_device = capacity, before._replace(**_places(capacity))
+        keep_pairs(kept, before, self.on_device)
+
+
+def _pieces(met: int) -> dict[str, ti.Ndarray]:
+    """Room for the pieces of so many pairs of patches, in which nothing is listed."""
+    due = ti.ndarray(ti.f32, 2 * met)
+    due.fill(NEVER)
+    return {"pieces": ti.ndarray(Four, 2 * met), "piece_due": due, "again": ti.ndarray(ti.i32, 2 * met)}
+
+
+def _places(capacity: int) -> dict[str, ti.Ndarray]:
+    """Room for so many pairs of elements."""
+    wanted, due = (ti.ndarray(ti.f32, capacity) for _ in range(2))
+    return {"pairs": ti.ndarray(Four, capacity), "wanted": wanted, "due": due}
+
 
 class SelfCollision:
     """Finds the pairs of cloth elements, of one cloth or several, that are near each other.
@@ -40,15 +153,20 @@ class SelfCollision:
     elements within thickness + skin, which holds until their motion, apart from rigid motion in common, has used the
     skin up. What is found in the lists does not depend on when they were made.
 
+    Where nothing may meet, bodies still need boxes of patches and of their displacements; vertices are neither tested
+    nor followed.
+
     Attributes:
         patches: of the cloths.
-        patch_pairs: which of them may meet, where they are, and how they move.
+        moving: where patches are, how they move in the substep, and how far contacts may displace them.
+        met: the pairs of patches that may meet within some substeps, and how much nearer each may come unsearched.
+        carried: numbers that these had before they were last paired, or -1.
         listed: pairs of elements.
         thickness: the largest [m].
         mean_edge: at rest, of all cloths together [m]; how far lists reach.
         coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart. `longest_edge` of all.
         meets: whether any elements may meet: of several cloths, or of one that collides with itself.
-        searches: how many pairs of patches were searched since `begin_frame`, over the number of patches.
+        expired_count, due_count: how many pairs of patches have to be searched, and have elements to be looked at.
         outcome: what the last `finish` answers, on the device.
 
     Args:
@@ -56,35 +174,53 @@ class SelfCollision:
     """
 
     def __init__(self, state: ClothState) -> None:
-        self.patches = Patches(state.host)
-        self.patch_pairs = PatchPairs(self.patches)
-        self._rest = Rest(state.body, on_device(state.host.position))
-        self._blocks = blocks_of(self.patches)
+        self._state, self.patches = state, Patches(state.host)
+        m, n, host = self.patches.count, state.vertex_count, state.host
+        self.moving: MovingPatches = with_room(
+            MovingPatches,
+            m,
+            corners=self.patches.corners,
+            boxes=with_room(Boxes, m),
+            motion=with_room(PatchMotion, m),
+        )
+        self._nodes = TrackedNodes(state.position, state.displacement, ti.Vector.ndarray(3, ti.f32, n))
+        self._rest, self._blocks = Rest(state.body, on_device(host.position)), blocks_of(self.patches)
+        self._tree: BoxTree = with_room(BoxTree, 2 * self.patches.leaves, leaves=self.patches.leaves)
+        self._taken, self._found = (ti.ndarray(ti.i32, 4) for _ in range(2))
+        self._first_known, self._needed = ti.ndarray(ti.i32, 2 * max(m, 1)), ti.ndarray(ti.i32, max(m, 1))
         self._collides = ti.ndarray(ti.i32, len(state.names))
-        self._taken = ti.ndarray(ti.i32, 4)
-        elements = state.vertex_count + len(state.host.edges.nodes)
-        self.listed = PairList(capacity=elements, met=self.patch_pairs.capacity)
-        edges = state.host.position[state.host.edges.nodes]
+        self._maxima = LaneReduction(maxima=7, sums=0)
+        self._room_for_met(8 * max(m, 1))
+        self.listed = PairList(capacity=n + len(host.edges.nodes), met=self._met_capacity)
+        edges = host.position[host.edges.nodes]
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
         self.mean_edge, self.longest_edge = float(lengths.mean()), float(lengths.max())
-        cloth_of = state.host.body[state.host.edges.nodes[:, 0]]
+        cloth_of = host.body[host.edges.nodes[:, 0]]
         self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
-        self._nothing = on_device(np.zeros(3, dtype=np.int32))
-        self.outcome = self._nothing
-        self.thickness = 0.0
+        self.outcome = self._nothing = on_device(np.zeros(3, dtype=np.int32))
+        self.thickness = self._astray = 0.0
+        self.due_count = self.expired_count = 0
         self._listed_for: tuple[bytes, tuple[bool, ...]] = (b"", ())
         self._is_forgotten, self._is_outrun = True, False
-        self.begin_frame(state)
+        self.begin_frame()
+
+    def _room_for_met(self, capacity: int) -> None:
+        self._met_capacity = capacity
+        kept = {"needed": self._needed, "taken": self._taken, "found": self._found}
+        self.met: PatchPairArrays = with_room(PatchPairArrays, capacity, count=0, **kept)
+        self._spare = ti.ndarray(Two, capacity), ti.ndarray(ti.f32, capacity)
+        self.carried, self._known = (ti.ndarray(ti.i32, capacity) for _ in range(2))
 
     def forget(self) -> None:
         """Search anew at the next `find`."""
         self._is_forgotten = True
 
-    def begin_frame(self, state: ClothState) -> None:
+    def begin_frame(self) -> None:
         """Margins of contacts are what they are at the start of a run, and searches are counted anew.
 
         Lists are kept, unless thicknesses or flags have changed: no result depends on when they were made.
         """
+        state = self._state
         self._searched, self._was_changed = 0, False
         thickness = copied(state.thickness)  # of each node, as pairs are listed with the distance that they keep
         listed_for = thickness.tobytes(), state.self_collision
@@ -94,19 +230,51 @@ class SelfCollision:
             self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
             self.forget()
         self.meets = len(state.names) > 1 or any(state.self_collision)
-        self.patch_pairs.set_margin(self.thickness, fits=self.meets)
+        self.moving.margin.fill(MARGIN * self.thickness)
+        self.moving.more.fill(0.0)
 
     @property
     def searches(self) -> float:
         """How often the elements of a patch were searched since `begin_frame`, on average."""
         return self._searched / max(self.patches.count, 1)
 
-    def look(self, state: ClothState) -> None:
+    @property
+    def _followed(self) -> Followed:
+        return Followed(self._nodes, self.moving, self.met, self.thickness, self._astray)
+
+    def look(self) -> None:
         """Note how cloth moves in this substep."""
         is_aged = self.meets and not (self._is_forgotten or self._is_outrun)
-        self._asked = self.patch_pairs.look(state, self._ageing if is_aged else None)
+        self._asked = self._ask(looks=True, ages=is_aged)
         self._looked: tuple[float, bool] | None = None
         self._is_searched = False
+
+    def _ask(self, *, looks: bool, ages: bool) -> Callable[[], tuple[float, bool]]:
+        """Look at the patches, then find which of their pairs have to be searched; either or both.
+
+        Asks how far vertices get apart from their common motion [m], and whether the pairs hold for this substep.
+        """
+        vertex_count = self._state.vertex_count if looks and self.meets else 0
+        edge = self.mean_edge
+        asked = look_at_patches.later(
+            vertex_count,
+            self._maxima.over(vertex_count),
+            STILL * self.thickness if self.meets else LARGEST_STILL,
+            self._followed,
+            max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge),
+            self.listed.on_device.piece_due,
+            (looks * workers_for(self.patches.count), ages * workers_for(int(self.met.count))),
+        )
+
+        def answer() -> tuple[float, bool]:
+            motion, astray, expired, due = asked()
+            if vertex_count:
+                self._astray = float(np.int32(astray).view(np.float32))
+            self.expired_count, self.due_count = max(int(expired), 0), int(due)
+            self._searched += self.expired_count
+            return float(np.int32(motion).view(np.float32)), expired >= 0
+
+        return answer
 
     def looked(self) -> tuple[float, bool]:
         """How far vertices get apart from their common motion [m]; and whether pairs of patches hold, so that `find`
@@ -115,34 +283,58 @@ class SelfCollision:
         if self._looked is None:
             motion, holds = self._asked()
             self._is_outrun |= not holds
-            self._searched += self.patch_pairs.expired_count
             self._looked = (motion, holds) if self.meets else (0.0, True)
         return self._looked
 
-    @property
-    def _ageing(self) -> Ageing:
-        """How pairs of patches are aged."""
-        edge = self.mean_edge
-        least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        return Ageing(self.thickness, least_skin, self.listed.on_device.piece_due)
+    def _pair_patches(self) -> None:
+        """List the pairs of patches that may get within a thickness, with what is known of their elements unless that
+        is forgotten.
+
+        Raises:
+            OverflowError: more pairs than any useful step has.
+        """
+        patches, tree = self.patches, self._tree
+        # If cloth was put elsewhere, nothing would be left of what is known.
+        keeps = not self._is_forgotten and self._astray < self.thickness
+        place_leaves(self.moving, self.mean_edge, self.thickness, tree)
+        first = patches.leaves
+        while first := first // 2:
+            merge_boxes(first, tree)
+        before = self.met.pairs, self.met.slack
+        known = KnownPairs(self._first_known, self._known, *before)
+        sort_known(int(self.met.count) if keeps else 0, patches.count, known, self._found)
+        pairs, slack = self._spare
+        self.met, self._spare = self.met._replace(pairs=pairs, slack=slack), before
+        while True:
+            found = pair_patches(
+                patches.count,
+                workers_for(patches.count),
+                tree,
+                patches.cloth,
+                self._collides,
+                known,
+                self.met,
+                self.carried,
+                self._met_capacity,
+            )
+            if not 0 <= found <= MAX_PAIRS:
+                raise OverflowError(TOO_MANY)
+            if found <= self._met_capacity:
+                break
+            self._room_for_met(int(GROWTH * found))
+        self.met = self.met._replace(count=int(found))
+        if keeps:
+            self.listed.carry(int(found), self.carried, self._met_capacity)
+        else:
+            self._astray = 0.0
+            self.listed.set_pieces(self._met_capacity)
 
     def warm_up(self) -> None:
         """Compile what carries lists over, and what makes room in them."""
-        self.listed.carry(0, self.patch_pairs.carried, self.patch_pairs.capacity)
+        self.listed.carry(0, self.carried, self._met_capacity)
         self.listed.resize(self.listed.capacity)
 
-    def finish(
-        self, state: ClothState, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
-    ) -> Callable[[], list[int]]:
-        """See `PatchPairs.finish`."""
-        if not (self.meets or is_changed or self._was_changed):
-            self.outcome = self._nothing
-            return lambda: [0, 0, 0]
-        self.outcome = self.patch_pairs.counters.found
-        self._was_changed = is_changed
-        return self.patch_pairs.finish(state, predicted, contacts, count, is_changed=is_changed)
-
-    def find(self, state: ClothState, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
+    def find(self, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.
 
         All pairs are listed first that vertices can bring within their thickness, or together, in this substep. Pairs
@@ -150,40 +342,65 @@ class SelfCollision:
         vertices within their margins.
 
         Args:
-            state: in a substep.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
             is_ahead: not to wait for what `look` has found; if pairs of patches do not hold, nothing is appended.
         """
-        met, listed = self.patch_pairs, self.listed
         if not is_ahead or self._is_forgotten or self._is_outrun:
             self.looked()
         if not self.meets:
             return
         if self._is_forgotten or self._is_outrun:
-            keeps = met.meet(self.thickness, self.mean_edge, self._collides, keeps=not self._is_forgotten)
-            if keeps:
-                listed.carry(met.count, met.carried, met.capacity)
-            else:
-                listed.set_pieces(met.capacity)
+            self._pair_patches()
             self._is_forgotten = self._is_outrun = False
-            self._searched += met.age(state, self._ageing)
+            self._ask(looks=False, ages=True)()
             self._looked, self._is_searched = (self.looked()[0], True), False
-        if not (is_ahead or met.expired_count or met.due_count):
+        if not (is_ahead or self.expired_count or self.due_count):
             return
         find_near_pairs(
-            (int(not self._is_searched), listed.capacity, workers_for(1)),
-            Counters(self._taken, met.counters.found),
-            met.on_device,
-            Boxes(met.bounds.low, met.bounds.high),
-            self._blocks,
-            listed.on_device,
-            state.surface,
-            self._rest,
-            recovery,
-            contacts.found,
+            (int(not self._is_searched), self.listed.capacity, workers_for(1)),
+            PairSearch(
+                self.met,
+                self.moving.boxes,
+                self._blocks,
+                self.listed.on_device,
+                self._state.surface,
+                self._rest,
+                recovery,
+                contacts.found,
+            ),
         )
         self._is_searched = True
+
+    def finish(
+        self, predicted: ti.Ndarray, contacts: ContactList, count: int, *, is_changed: bool
+    ) -> Callable[[], list[int]]:
+        """Test contacts, and if all is well the substep is over: its motion is used up, and what contacts added to it.
+
+        Where they displaced patches farther than allowed for, they may displace these half as far again from now on.
+        Asks for what `end_contacts` returns.
+
+        Args:
+            predicted: displacements as contacts were looked for.
+            contacts: in the substep.
+            count: of those that are tested.
+            is_changed: whether contacts changed displacements.
+        """
+        if not (self.meets or is_changed or self._was_changed):
+            self.outcome = self._nothing
+            return lambda: [0, 0, 0]
+        self.outcome, self._was_changed = self._found, is_changed
+        state, patches = self._state, workers_for(self.patches.count)
+        return end_contacts.later(
+            count if self.meets else 0,
+            contacts.found,
+            TestedContacts(contacts.impulses().impulse, state.inverse_mass, state.thickness, contacts.crossing),
+            state.vertex_count if self.meets else 0,
+            predicted,
+            int(is_changed),
+            self._followed,
+            (is_changed * patches, patches, workers_for(int(self.met.count))),
+        )
 
 
 def box_of(vectors: ti.Ndarray, first: int, end: int, ends_of: LaneReduction) -> Callable[[], Box]:

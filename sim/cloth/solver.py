@@ -223,11 +223,10 @@ class ClothSolver:
         """Numbers of a cloth's nodes in the scene."""
         if name not in self.state.names:
             raise ValueError(f'no cloth is named "{name}"; cloths are {", ".join(self.state.names)}')
-        first, last = self.state.host.first_node[self.state.names.index(name) :][:2]
-        numbers = np.unique(np.asarray(nodes, dtype=np.int64))
-        if not len(numbers) or numbers[0] < 0 or numbers[-1] >= last - first:
-            raise ValueError(f'nodes of cloth "{name}" are 0 to {last - first - 1}, got {list(nodes)}')
-        return numbers + first
+        rows, numbers = self._rows_of(name), np.unique(np.asarray(nodes, dtype=np.int64))
+        if not len(numbers) or numbers[0] < 0 or numbers[-1] >= rows.stop - rows.start:
+            raise ValueError(f'nodes of cloth "{name}" are 0 to {rows.stop - rows.start - 1}, got {list(nodes)}')
+        return numbers + rows.start
 
     def _change_to(self, parameters: tuple[ClothParameters, ...]) -> None:
         """Adopt parameters, or keep those that are there and raise ValueError if the solver cannot have them."""
@@ -255,7 +254,7 @@ class ClothSolver:
         steps, and gains energy.
         """
         dt = min(self._asked_dt, self._free_dt / self._refinement)
-        return dt if self.contacts is None else self.contacts.stable_dt(self.state, dt)
+        return dt if self.contacts is None else self.contacts.stable_dt(dt)
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
@@ -295,7 +294,7 @@ class ClothSolver:
                 turns.measure()
             finish_step(state.nodes, state.position, state.limit, dt, reasons)
 
-        if self.contacts is None or not self.contacts.resolve(state, dt, turns, conclude):
+        if self.contacts is None or not self.contacts.resolve(dt, turns, conclude):
             conclude(self._no_reasons)
         excess = turns.excess
         self._excess = float(excess[self._refines].max(initial=0.0))

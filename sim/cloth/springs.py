@@ -276,8 +276,6 @@ def greedy_colours(nodes: NDArray[np.integer], node_count: int) -> NDArray[np.in
     return colours
 
 
-Floats = NDArray[np.float64]
-
 STEP_SAFETY = 0.7
 """Share of the linear limit that counts as stable, omega dt < 1.4: springs that turn are not linear, and modes that
 swing once in three or four steps (omega dt = 3^(1/2) and 2^(1/2)) resonate (Schlick et al. 1998, "Nonlinear resonance
@@ -304,13 +302,10 @@ def longest_explicit_step(
         cells: cells and their law, (m, 4).
         inverse_mass: of all nodes [1/kg], (n,); 0 where a node is held.
     """
-    rows = np.zeros((2, len(inverse_mass)))
-    for springs, spring_stiffness, spring_damping in families:
+    found: list[tuple[Indices, Floats, Floats]] = []
+    for springs, stiffness, damping in families:
         size = np.abs(springs.coefficients)
-        row = size * size.sum(axis=1, keepdims=True) * spring_stiffness[:, None]
-        nodes = springs.nodes.ravel()
-        for number, values in enumerate((row, row * spring_damping[:, None])):
-            rows[number] += np.bincount(nodes, weights=values.ravel(), minlength=rows.shape[1])
+        found.append((springs.nodes, size * size.sum(axis=1, keepdims=True) * stiffness[:, None], damping))
     for group, law in cells:
         stretch, shear, poisson, tau = law.T
         u, v = np.abs(group.along), np.abs(group.across)
@@ -318,12 +313,15 @@ def longest_explicit_step(
             u * u.sum(axis=1, keepdims=True) + v * v.sum(axis=1, keepdims=True)
         )
         row += shear[:, None] * (u + v) * (u + v).sum(axis=1, keepdims=True)
+        found.append((group.nodes, row, tau))
+    rows = np.zeros((2, len(inverse_mass)))
+    for nodes, row, tau in found:
         for number, values in enumerate((row, row * tau[:, None])):
-            rows[number] += np.bincount(group.nodes.ravel(), weights=values.ravel(), minlength=rows.shape[1])
-    stiffness, damping = (float(rate) for rate in (rows * inverse_mass).max(axis=1))
-    if stiffness == 0.0:
+            rows[number] += np.bincount(nodes.ravel(), weights=values.ravel(), minlength=rows.shape[1])
+    squared, damped = (float(rate) for rate in (rows * inverse_mass).max(axis=1))
+    if squared == 0.0:
         return math.inf
-    return STEP_SAFETY * (math.sqrt(damping**2 + 4.0 * stiffness) - damping) / stiffness
+    return STEP_SAFETY * (math.sqrt(damped**2 + 4.0 * squared) - damped) / squared
 
 
 def too_few_substeps(substeps: int, frame_dt: float, stable_dt: float) -> str | None:

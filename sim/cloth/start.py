@@ -219,17 +219,12 @@ def _piercings(ends: Floats, corners: Floats) -> Floats:
 
 
 def _touches_at_end(ends: Floats, corners: Floats) -> Floats:
-    """Ends of segments within `TOUCHING` above or below the triangles of the same rows [m], (k, 3)."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    normal = np.cross(b - a, c - a)
-    squared = _dot(normal, normal)
-    touching = []
-    for p in np.moveaxis(ends, 1, 0):
-        beside = np.abs(_dot(p - a, normal)) <= TOUCHING * np.sqrt(squared)
-        for u, v in ((a, b), (b, c), (c, a)):
-            beside &= _dot(np.cross(v - u, p - u), normal) >= 0.0
-        touching.append(p[beside & (squared > 0.0)])
-    return np.concatenate(touching)
+    """Ends of segments within `TOUCHING` of the triangles of the same rows [m], (k, 3)."""
+    from trimesh.triangles import closest_point
+
+    return np.concatenate(
+        [p[np.linalg.norm(p - closest_point(corners, p), axis=1) <= TOUCHING] for p in np.moveaxis(ends, 1, 0)]
+    )
 
 
 def _touches_at_side(ends: Floats, corners: Floats) -> Floats:

@@ -55,8 +55,9 @@ class HostCloths:
     def of(cls, cloths: Sequence[ClothParameters], sheets: Sequence[RestSheet]) -> "HostCloths":
         """Place the sheets in the world."""
         counts = [len(sheet.vertices) for sheet in sheets]
-        first_node = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        triangle_counts = [len(sheet.triangles) for sheet in sheets]
+        first_node, first_triangle = (
+            np.cumsum([0, *each]) for each in (counts, [len(sheet.triangles) for sheet in sheets])
+        )
         triangles = np.concatenate(
             [sheet.triangles + first for sheet, first in zip(sheets, first_node[:-1], strict=True)]
         ).astype(np.int32)
@@ -64,7 +65,7 @@ class HostCloths:
         return cls(
             names=tuple(cloth.name for cloth in cloths),
             first_node=first_node,
-            first_triangle=np.concatenate([[0], np.cumsum(triangle_counts)]).astype(np.int64),
+            first_triangle=first_triangle,
             position=np.concatenate(placed),
             velocity=np.concatenate([np.tile(cloth.velocity, (n, 1)) for cloth, n in zip(cloths, counts, strict=True)]),
             node_area=np.concatenate([sheet.node_area for sheet in sheets]),
@@ -79,9 +80,9 @@ class HostCloths:
         """A number of each cloth for each of its nodes, (n,)."""
         return np.asarray(values, dtype=np.float64)[self.body]
 
-    def of_triangles(self, values: Sequence[float]) -> NDArray[np.float64]:
-        """A number of each cloth for each of its triangles, (k,)."""
-        return np.repeat(np.asarray(values, dtype=np.float64), np.diff(self.first_triangle))
+    def of_triangles(self, values: Sequence[float | Sequence[float]]) -> NDArray[np.float64]:
+        """A number of each cloth, or a row of them, for each of its triangles, (k,) or (k, c)."""
+        return np.repeat(np.asarray(values, dtype=np.float64), np.diff(self.first_triangle), axis=0)
 
 
 class ClothState:
@@ -124,11 +125,7 @@ class ClothState:
         self.position, _, self.thickness, self.friction = self.surface
         self.elastic = ti.Vector.ndarray(3, ti.f32, n)
         self.mass = ti.ndarray(ti.f32, n)
-        self.body, self.triangles, self.edges = (
-            on_device(host.body),
-            on_device(host.triangles),
-            on_device(host.edges.nodes),
-        )
+        self.body, self.triangles = on_device(host.body), on_device(host.triangles)
         self.eyelets = np.zeros(n)
         self.self_collision: tuple[bool, ...] = ()
         self.is_free: tuple[bool, ...] = ()
@@ -174,11 +171,11 @@ class ClothState:
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take mass, thickness, friction and whether they collide with themselves from the cloths' parameters."""
-        mass = self.host.node_area * self.host.of_nodes([cloth.mass_per_area for cloth in cloths])
-        mass += self.eyelets
+        of_nodes = self.host.of_nodes
+        mass = self.host.node_area * of_nodes([cloth.mass_per_area for cloth in cloths]) + self.eyelets
         self.mass.from_numpy(mass.astype(np.float32))
-        self.thickness.from_numpy(self.host.of_nodes([cloth.thickness for cloth in cloths]).astype(np.float32))
-        self.friction.from_numpy(self.host.of_nodes([cloth.friction for cloth in cloths]).astype(np.float32))
+        self.thickness.from_numpy(of_nodes([cloth.thickness for cloth in cloths]).astype(np.float32))
+        self.friction.from_numpy(of_nodes([cloth.friction for cloth in cloths]).astype(np.float32))
         self.self_collision = tuple(cloth.self_collision for cloth in cloths)
 
     def set_pinned(self, is_pinned: NDArray[np.bool_]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from sim.cloth.bundles import Nodes, SpringArrays, ThreadWork
-from sim.cloth.device_springs import LANES, TINY_LENGTH, DeviceSprings, colour_bounds, column, set_column
+from sim.cloth.device_springs import LANES, TINY_LENGTH, Bounds, DeviceSprings, between, column, set_column
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func, with_room
@@ -66,10 +66,10 @@ class ThreadSolver:
 
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
-        springs, nodes, step = self.springs, state.nodes, self.springs.first_colours.step
+        springs, nodes = self.springs, state.nodes
         springs.contract(nodes, state.displacement)
-        for colour in springs.first_colours:
-            solve_threads(springs.on_device, colour, nodes, dt, int(is_first), self._work, self._rows, step)
+        for bounds in springs.colours:
+            solve_threads(springs.on_device, bounds, nodes, dt, int(is_first), self._work, self._rows, springs.at_once)
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for fixed directions.
@@ -78,18 +78,14 @@ class ThreadSolver:
         x + beta (u - u*) for displacements u and those of the prediction u*: (M + beta dt² K) (u - u*) = M (u~ - u*)
         with u~ of the fixed directions, where K is the Laplacian of the thread with weights T/|d|.
         """
-        springs, step = self.springs, self.springs.first_colours.step
-        for colour in springs.first_colours:
-            straighten_threads(springs.on_device, colour, state.nodes, dt, self._work, self._rows, step)
+        springs = self.springs
+        for bounds in springs.colours:
+            straighten_threads(springs.on_device, bounds, state.nodes, dt, self._work, self._rows, springs.at_once)
 
     def excess(self, state: ClothState, dt: float) -> Callable[[], tuple[float, float]]:
-        """Asks for the largest excess of a spring [rest lengths], and how many have not converged
-        (`excess_of`).
-        """
-        springs = self.springs
-        return measure_excess.later(
-            springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt, self._found
-        )
+        """Asks for the largest excess of a spring [rest lengths], and how many have not converged."""
+        springs, multiplier = self.springs.on_device, self._work.multiplier
+        return measure_excess.later(springs, multiplier, state.nodes, dt * dt, self._found)
 
 
 @ti.func
@@ -243,7 +239,7 @@ def straighten_piece(p: ti.i32, springs: SpringArrays, nodes: Nodes, dt: ti.f32,
 @large_kernel
 def solve_threads(
     springs: SpringArrays,
-    first: ti.i32,
+    bounds: Bounds,
     nodes: Nodes,
     dt: ti.f32,
     is_first: ti.i32,
@@ -251,7 +247,7 @@ def solve_threads(
     rows: ti.template(),
     colours: ti.template(),
 ):
-    """So many colours, from `first` on, each piece exactly, by `rows` threads of a GPU:
+    """So many colours, within their bounds, each piece exactly, by `rows` threads of a GPU:
 
         (w_s + w_s+1 + a) D_s - w_s n_s-1.n_s D_s-1 - w_s+1 n_s.n_s+1 D_s+1 = -C_s - a l_s,   a = 1/(k dt²)
 
@@ -259,7 +255,7 @@ def solve_threads(
     of that. `tension` becomes what turns of -l_s / |d|, `is_taut` whether a piece has too much of it.
     """
     threads = ti.static(rows if runs_on_gpu() else 1)
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = threads * bounds
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
             ti.loop_config(block_dim=rows)
@@ -297,23 +293,15 @@ def solve_threads(
                 if k == 0:
                     work.is_taut[p] = 0
                 ti.simt.block.sync()
-                lower, diagonal, upper, missing = 0.0, 1.0, 0.0, 0.0
+                lower, diagonal, upper, right = 0.0, 1.0, 0.0, ti.math.vec3(0.0)
                 if k < count:
                     diagonal = w_i + w_j + compliance
-                    missing = springs.law[s][0] - springs.shift[s] - length - compliance * before
+                    right.x = springs.law[s][0] - springs.shift[s] - length - compliance * before
                     if k > 0:
                         lower = -w_i * n.dot(ti.math.vec3(of_x[k - 1], of_y[k - 1], of_z[k - 1]))
                     if k + 1 < count:
                         upper = -w_j * n.dot(ti.math.vec3(of_x[k + 1], of_y[k + 1], of_z[k + 1]))
-                change = reduced_row(
-                    k,
-                    rows,
-                    lower,
-                    diagonal,
-                    upper,
-                    ti.math.vec3(missing, 0.0, 0.0),
-                    (one, two, three, of_x, of_y, of_z),
-                ).x
+                change = reduced_row(k, rows, lower, diagonal, upper, right, (one, two, three, of_x, of_y, of_z)).x
                 push = change * n
                 of_x[k], of_y[k], of_z[k] = push.x, push.y, push.z
                 ti.simt.block.sync()
@@ -342,7 +330,7 @@ def solve_threads(
 @large_kernel
 def straighten_threads(
     springs: SpringArrays,
-    first: ti.i32,
+    bounds: Bounds,
     nodes: Nodes,
     dt: ti.f32,
     work: ThreadWork,
@@ -356,7 +344,7 @@ def straighten_threads(
     spring from node i on.
     """
     threads = ti.static(rows if runs_on_gpu() else 1)
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, first, colours, threads)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = threads * bounds
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         if ti.static(runs_on_gpu()):
             ti.loop_config(block_dim=rows)
@@ -388,44 +376,26 @@ def straighten_threads(
                     straighten_piece(p, springs, nodes, dt, work)
 
 
-@func
-def excess_of(
-    i: ti.i32,
-    j: ti.i32,
-    rest: ti.f32,
-    shift: ti.f32,
-    stiffness: ti.f32,
-    multiplier: ti.f32,
-    nodes: Nodes,
-    dt_squared: ti.f32,
-) -> ti.f32:
-    """(|d| - rest + shift + l/(k dt²)) / rest, nothing for a spring between two nodes that are held.
+@kernel
+def measure_excess(
+    springs: SpringArrays, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
+) -> ti.math.vec2:
+    """Largest excess of springs of threads, (|d| - rest + shift + l/(k dt²)) / rest, nothing between two nodes that
+    are held; and how many have not converged. Two numbers are `found`.
 
     Where a spring is solved, its multiplier is -k dt² times its stretch. What is solved after it moves its nodes on,
     and what that leaves is no stretch of the material: it falls with every sweep, and with the square of the step.
     Rubber that is drawn to twice its length has none of it.
     """
-    d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
-        nodes.displacement[i] - nodes.displacement[j]
-    )
-    excess = (d.norm() - rest + shift + multiplier / (stiffness * dt_squared)) / rest
-    return ti.select(nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0, excess, 0.0)
-
-
-@kernel
-def measure_excess(
-    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32, found: Integers
-) -> ti.math.vec2:
-    """Largest excess of springs of threads in lists, and how many have not converged; two numbers are `found`."""
-    end, whole_end = count, whole_warps(count)
+    end, whole_end = springs.count, whole_warps(springs.count)
     found[0], found[1] = 0, 0
     for s in range(whole_end):
         excess = 0.0
         if s < end:
-            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
-            excess = excess_of(
-                i, j, springs.law[s][0], springs.shift[s], springs.law[s][1], multiplier[s], nodes, dt_squared
-            )
+            i, j, law = springs.nodes[2 * s], springs.nodes[2 * s + 1], springs.law[s]
+            length = between(i, j, nodes, nodes.displacement).norm()
+            if nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0:
+                excess = (length - law[0] + springs.shift[s] + multiplier[s] / (law[1] * dt_squared)) / law[0]
         # Bits of numbers from 0 on are in their order.
         largest = largest_in_warp(ti.bit_cast(ti.select(excess > 0.0, excess, 0.0), ti.i32))
         if largest > found[0] and (ti.static(not on_cuda()) or s % WARP == 0):  # others would wait to change nothing

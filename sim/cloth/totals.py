@@ -10,7 +10,7 @@ import taichi as ti
 
 from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.device_cells import DeviceCells, sum_over_cells
-from sim.cloth.device_springs import DeviceSprings, coefficient, separation
+from sim.cloth.device_springs import DeviceSprings, span
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Vectors
 from sim.core.launch import kernel
@@ -44,11 +44,11 @@ class ClothTotals:
         for springs in self._springs:
             springs.contract(state.nodes, state.carry)
             share = self._of_springs.over(springs.count)
-            found.append(sum_over_springs(springs.on_device, state.nodes, springs.count, springs.arity, share))
+            found.append(sum_over_springs(springs.on_device, state.nodes, springs.arity, share))
         for cells in self._cells:
             cells.measure_strains(state.nodes, is_damped=False)
-            share, law = self._of_springs.over(cells.count), (cells.on_device, cells.mesh)
-            found.append(sum_over_cells(*law, state.nodes, cells.count, cells.arity, share))
+            share = self._of_springs.over(cells.count)
+            found.append(sum_over_cells(cells.on_device, state.nodes, cells.arity, share))
         strains, energies = zip(*((float(each[0]), float(each[1])) for each in found), strict=True)
         return {"elastic_energy": sum(energies), "max_strain": max(0.0, *strains)}
 
@@ -62,12 +62,8 @@ def sum_over_nodes(
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(tree.lanes):
-        fastest = 0.0
-        momentum = ti.math.vec3(0.0)
-        kinetic = 0.0
-        potential = 0.0
-        bad = 0.0
-        lost = 0.0
+        fastest, momentum = 0.0, ti.math.vec3(0.0)
+        kinetic, potential, bad, lost = 0.0, 0.0, 0.0, 0.0
         for k in range(share.items):
             i = lane * share.lane_step + k * share.item_step
             if i < count:
@@ -93,7 +89,7 @@ def sum_over_nodes(
 
 
 @kernel
-def sum_over_springs(springs: SpringArrays, nodes: Nodes, count: ti.i32, arity: ti.template(), share: Share) -> Results:
+def sum_over_springs(springs: SpringArrays, nodes: Nodes, arity: ti.template(), share: Share) -> Results:
     """Largest strain of springs with two nodes; elastic energy."""
     (tree,) = ti.static((share.tree,))
     if ti.static(not runs_on_gpu()):
@@ -103,11 +99,8 @@ def sum_over_springs(springs: SpringArrays, nodes: Nodes, count: ti.i32, arity: 
         energy = 0.0
         for k in range(share.items):
             s = lane * share.lane_step + k * share.item_step
-            if s < count:
-                d = separation(springs, nodes, s, arity)
-                for a in ti.static(range(arity)):
-                    d += coefficient(springs, s, arity, a) * nodes.carry[springs.nodes[arity * s + a]]
-                error = d.norm() - springs.law[s][0]
+            if s < springs.count:
+                error = span(springs, nodes, nodes.carry, s, arity).norm() - springs.law[s][0]
                 energy += 0.5 * springs.law[s][1] * error * (error + springs.shift[s])
                 if ti.static(arity == 2):
                     largest = ti.max(largest, error / springs.law[s][0])

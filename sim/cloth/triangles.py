@@ -4,7 +4,7 @@ import taichi as ti
 
 from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, TriangleSystem, TriangleWork
 from sim.cloth.cells import OWN_SHARE, TRIANGLE
-from sim.cloth.device_cells import DeviceCells, derivative, mean_strain, shear_of, tension_of
+from sim.cloth.device_cells import DeviceCells, change_of, derivative, mean_strain, shear_of, strain_by, tension_of
 from sim.cloth.device_springs import TINY_LENGTH
 from sim.cloth.state import ClothState
 from sim.cloth.threads import LARGEST_RESIDUAL, STRAIGHTENED, direction_of
@@ -51,32 +51,23 @@ class TriangleSolver:
     """
 
     def __init__(self, state: ClothState, cells: DeviceCells) -> None:
-        self._state, self.cloths = state, cells.cloths
-        count, n = cells.count, state.vertex_count
+        self._state, self.cloths, self._mesh = state, cells.cloths, cells.on_device.mesh
+        n = state.vertex_count
         work = with_room(
             TriangleWork,
             n,
             scalars=ti.ndarray(ti.f32, 2 * MOST_ITERATIONS + 1),
-            moment=ti.Vector.ndarray(4, ti.f32, cells.chunks),
-            shift=ti.Vector.ndarray(3, ti.f32, cells.pieces),
+            moment=ti.Vector.ndarray(4, ti.f32, self._mesh.chunks),
+            shift=ti.Vector.ndarray(3, ti.f32, self._mesh.pieces),
         )
-        self._system = TriangleSystem(
-            count,
-            cells.own,
-            cells.chunks,
-            cells.pieces,
-            cells.on_device,
-            cells.mesh,
-            with_room(TriangleFrames, count),
-            work,
-        )
+        self._system = TriangleSystem(cells.on_device, with_room(TriangleFrames, cells.count), work)
         self._expected = ti.Vector.ndarray(2, ti.f32, n)
         self._sums, self._of_excess = LaneReduction(maxima=0, sums=2), LaneReduction(maxima=1, sums=1)
         self._left = self._mass = self._least = 0.0
 
     def take_parameters(self) -> None:
         """Mass as it is now; cells hold their stiffness."""
-        self._mass = float(self._state.mass.to_numpy()[self._system.mesh.node.to_numpy()].sum())
+        self._mass = float(self._state.mass.to_numpy()[self._mesh.node.to_numpy()].sum())
 
     def displace(self, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the triangles let them go.
@@ -84,7 +75,7 @@ class TriangleSolver:
         Once more in a step: from where the nodes are now, with what triangles pushed them by so far as an impulse.
         """
         system, state = self._system, self._state
-        share = self._sums.over(system.own)
+        share = self._sums.over(self._mesh.count)
         linearize(system, state.nodes, dt)
         begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share)
         self._left = 1.0
@@ -104,7 +95,7 @@ class TriangleSolver:
         """Largest excess of strain at a node [-], 1 if `MOST_ITERATIONS` were too few; and how many are beyond
         `LARGEST_RESIDUAL`.
         """
-        share = self._of_excess.over(self._system.own)
+        share = self._of_excess.over(self._mesh.count)
         found = measure_node_excess(self._system, self._state.nodes, self._expected, share)
         return max(float(found[0]), self._left), int(found[1])
 
@@ -119,8 +110,8 @@ def stiffer(s: ti.i32, cells: CellArrays, rate: ti.f32) -> ti.f32:
 def strain(s: ti.i32, system: TriangleSystem, moved: Vectors, rate: ti.f32) -> ti.math.vec2:
     """Changes of e_u and e_v by vectors at the nodes; the two forces of K without these into `frames`."""
     cells, frames = ti.static((system.cells, system.frames))
-    d_u = change_of(cells.along, cells, moved, s)
-    d_v = change_of(cells.across, cells, moved, s)
+    d_u = change_of(cells.along, cells, moved, s, TRIANGLE)
+    d_v = change_of(cells.across, cells, moved, s, TRIANGLE)
     n_u, n_v, turning = frames.n_u[s], frames.n_v[s], frames.turning[s]
     by_u, by_v = frames.by_u[s], frames.by_v[s]
     e_u, e_v = n_u.dot(d_u), n_v.dot(d_v)
@@ -137,26 +128,17 @@ def strain(s: ti.i32, system: TriangleSystem, moved: Vectors, rate: ti.f32) -> t
 @func
 def stretch(s: ti.i32, system: TriangleSystem, rate: ti.f32):
     """Add the forces by e_u and e_v to those in `frames`."""
-    cells, mesh, frames = ti.static((system.cells, system.mesh, system.frames))
-    tension = tension_of(s, cells, mesh, mesh.strain, mesh.mean)
+    cells, mesh, frames = ti.static((system.cells, system.cells.mesh, system.frames))
+    tension = tension_of(s, cells, mesh.strain, mesh.mean)
     tension *= stiffer(s, cells, rate)
     frames.s_u[s] = frames.s_u[s] + tension[0] * frames.n_u[s]
     frames.s_v[s] = frames.s_v[s] + tension[1] * frames.n_v[s]
 
 
 @func
-def change_of(coefficients: Floats, cells: CellArrays, vectors: Vectors, s: ti.i32) -> ti.math.vec3:
-    """sum_a c_a of vectors at the corners."""
-    total = ti.math.vec3(0.0)
-    for a in ti.static(range(TRIANGLE)):
-        total += coefficients[TRIANGLE * s + a] * vectors[cells.nodes[TRIANGLE * s + a]]
-    return total
-
-
-@func
 def gathered(k: ti.i32, system: TriangleSystem) -> ti.math.vec3:
     """Sum over the corners at a node of what the triangles' two forces are there [N]."""
-    cells, mesh, frames = ti.static((system.cells, system.mesh, system.frames))
+    cells, mesh, frames = ti.static((system.cells, system.cells.mesh, system.frames))
     total = ti.math.vec3(0.0)
     for at in range(mesh.start[k], mesh.start[k + 1]):
         corner = mesh.corner[at]
@@ -168,7 +150,7 @@ def gathered(k: ti.i32, system: TriangleSystem) -> ti.math.vec3:
 @func
 def block(k: ti.i32, system: TriangleSystem, rate: ti.f32):
     """About the 3 x 3 block of K at a node [N/m]: means have a sixth of the stiffness on equal triangles."""
-    cells, mesh, frames = ti.static((system.cells, system.mesh, system.frames))
+    cells, mesh, frames = ti.static((system.cells, system.cells.mesh, system.frames))
     total = ti.Matrix.zero(ti.f32, 3, 3)
     one = ti.Matrix.identity(ti.f32, 3)
     for at in range(mesh.start[k], mesh.start[k + 1]):
@@ -205,8 +187,8 @@ def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32):
 
     Damping adds tau times the rate at which the prediction strains.
     """
-    cells, mesh, frames, work = ti.static((system.cells, system.mesh, system.frames, system.work))
-    for s in range(system.count):
+    cells, mesh, frames, work = ti.static((system.cells, system.cells.mesh, system.frames, system.work))
+    for s in range(system.cells.count):
         start_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
         start_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
         d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
@@ -230,11 +212,11 @@ def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32):
         lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
         pull = ROOT_HALF * cells.law[s][1] * shear_of(start_u, start_v)[0]
         frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
-    for k in range(system.own):
+    for k in range(system.cells.mesh.count):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
         work.start_mean[mesh.node[k]] = mean_strain(k, mesh, frames.start)
-    for s in range(system.count):
-        tension = tension_of(s, cells, mesh, frames.start, work.start_mean)
+    for s in range(system.cells.count):
+        tension = tension_of(s, cells, frames.start, work.start_mean)
         frames.turning[s] = ti.max(frames.turning[s] * ti.math.vec4(tension, 1.0, 1.0), 0.0)
         stretch(s, system, 0.0)
         frames.s_u[s], frames.s_v[s] = dt * dt * frames.s_u[s], dt * dt * frames.s_v[s]
@@ -243,14 +225,14 @@ def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32):
 @func
 def multiply(system: TriangleSystem, nodes: Nodes, dt: ti.f32, product: Vectors):
     """(M + dt² K) z of all nodes that are not held, else 0; for the outermost level of a kernel."""
-    mesh, work = ti.static((system.mesh, system.work))
-    for s in range(system.count):
+    mesh, work = ti.static((system.cells.mesh, system.work))
+    for s in range(system.cells.count):
         mesh.strain[s] = strain(s, system, work.z, 1.0 / dt)
-    for k in range(system.own):
+    for k in range(system.cells.mesh.count):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
-    for s in range(system.count):
+    for s in range(system.cells.count):
         stretch(s, system, 1.0 / dt)
-    for k in range(system.own):
+    for k in range(system.cells.mesh.count):
         i = mesh.node[k]
         w_i = nodes.inverse_mass[i]
         total = ti.math.vec3(0.0)
@@ -269,8 +251,8 @@ def sum_products(system: TriangleSystem, product: Vectors, share: Share):
         of_rest, of_product = 0.0, 0.0
         for k in range(share.items):
             n = lane * share.lane_step + k * share.item_step
-            if n < system.own:
-                i = system.mesh.node[n]
+            if n < system.cells.mesh.count:
+                i = system.cells.mesh.node[n]
                 of_rest += work.z[i].dot(work.r[i])
                 of_product += work.z[i].dot(product[i])
         tree.partial[lane], tree.partial[tree.lanes + lane] = of_rest, of_product
@@ -282,8 +264,8 @@ def begin_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, dt: 
     """Residual at the start, and inverse blocks; in the first solve of a step the start is a multiple of `elastic`, and
     that is 0 from there on.
     """
-    tree, mesh, work = ti.static((share.tree, system.mesh, system.work))
-    for k in range(system.own):
+    tree, mesh, work = ti.static((share.tree, system.cells.mesh, system.work))
+    for k in range(system.cells.mesh.count):
         i = mesh.node[k]
         w_i = nodes.inverse_mass[i]
         e_i, r_i = ti.math.vec3(0.0), ti.math.vec3(0.0)
@@ -301,7 +283,7 @@ def begin_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, dt: 
         elastic[i] = ti.select(is_first, 0.0, e_i)
     multiply(system, nodes, dt, work.q)
     sum_products(system, work.q, share)
-    for k in range(system.own):
+    for k in range(system.cells.mesh.count):
         i = mesh.node[k]
         work_done, energy = tree.nodes[0], tree.nodes[tree.lanes // BRANCHES]
         multiple = work_done / ti.max(energy, TINY_ENERGY)
@@ -325,8 +307,8 @@ def iterate(system: TriangleSystem, nodes: Nodes, dt: ti.f32, first: ti.i32, sha
     for step in ti.static(range(ITERATIONS_AT_ONCE)):
         multiply(system, nodes, dt, work.a_z)
         sum_products(system, work.a_z, share)
-        for k in range(system.own):
-            i = system.mesh.node[k]
+        for k in range(system.cells.mesh.count):
+            i = system.cells.mesh.node[k]
             gamma, delta = tree.nodes[0], tree.nodes[tree.lanes // BRANCHES]
             beta, before = 0.0, 1.0
             if first + step > 0:
@@ -360,25 +342,13 @@ def decrease(scalars: Floats, first: ti.i32, end: ti.i32) -> ti.math.vec2:
     return ti.math.vec2(last, whole)
 
 
-@func
-def measure_displaced(system: TriangleSystem, nodes: Nodes):
-    """Strains of triangles, then of nodes, where displacements lead; for the outermost level of a kernel."""
-    cells, mesh = ti.static((system.cells, system.mesh))
-    for s in range(system.count):
-        d_u = derivative(cells.along, cells, nodes, nodes.displacement, s, TRIANGLE)
-        d_v = derivative(cells.across, cells, nodes, nodes.displacement, s, TRIANGLE)
-        mesh.strain[s] = ti.math.vec2(d_u.norm() - 1.0, d_v.norm() - 1.0)
-    for k in range(system.own):
-        mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
-
-
 @kernel
 def finish_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, expected: Strains):
     """Displace the nodes by the solution, less what momentum it has in each piece that no pin holds; the strains that
     nodes are expected to have then.
     """
-    mesh, work = ti.static((system.mesh, system.work))
-    for chunk in range(system.chunks):
+    mesh, work = ti.static((system.cells.mesh, system.work))
+    for chunk in range(mesh.chunks):
         moment, mass = ti.math.vec3(0.0), 0.0
         for k in range(mesh.chunk[chunk], mesh.chunk[chunk + 1]):
             i = mesh.node[k]
@@ -389,36 +359,36 @@ def finish_iteration(system: TriangleSystem, nodes: Nodes, elastic: Vectors, exp
             moment += m_i * work.x[i]
             mass += m_i
         work.moment[chunk] = ti.math.vec4(moment, mass)
-    for piece in range(system.pieces):
+    for piece in range(mesh.pieces):
         total = ti.math.vec4(0.0)
         for chunk in range(mesh.first_chunk[piece], mesh.first_chunk[piece + 1]):
             total += work.moment[chunk]
         work.shift[piece] = ti.select(total[3] < HELD, total.xyz / total[3], 0.0)
-    for k in range(system.own):
+    for k in range(system.cells.mesh.count):
         i = mesh.node[k]
         if nodes.inverse_mass[i] > 0.0:
             x_i = work.x[i] - work.shift[mesh.piece[k]]
             elastic[i] = elastic[i] + x_i
             nodes.displacement[i] = nodes.displacement[i] + x_i
-    measure_displaced(system, nodes)
-    for k in range(system.own):
+    strain_by(nodes.displacement, 0, system.cells, nodes)
+    for k in range(system.cells.mesh.count):
         expected[mesh.node[k]] = mesh.mean[mesh.node[k]]
 
 
 @kernel
 def measure_node_excess(system: TriangleSystem, nodes: Nodes, expected: Strains, share: Share) -> Results:
-    """Largest excess of strain of nodes of triangles, as `threads.excess_of` has it, and how many along warp and weft
-    are beyond `LARGEST_RESIDUAL`.
+    """Largest excess of strain of nodes of triangles, as `threads.measure_excess` has it, and how many along warp and
+    weft are beyond `LARGEST_RESIDUAL`.
     """
-    tree, mesh = ti.static((share.tree, system.mesh))
-    measure_displaced(system, nodes)
+    tree, mesh = ti.static((share.tree, system.cells.mesh))
+    strain_by(nodes.displacement, 0, system.cells, nodes)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for lane in range(tree.lanes):
         largest, unconverged = 0.0, 0.0
         for k in range(share.items):
             n = lane * share.lane_step + k * share.item_step
-            if n < system.own:
+            if n < system.cells.mesh.count:
                 excess = mesh.mean[mesh.node[n]] - expected[mesh.node[n]]
                 largest = ti.max(largest, excess.x, excess.y)
                 for axis in ti.static(range(2)):

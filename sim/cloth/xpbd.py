@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.cells import TRIANGLE
 from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
+from sim.cloth.device_springs import TINY_LENGTH, Bounds, DeviceSprings, between, coefficient, separation
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
 from sim.cloth.triangles import TriangleSolver
@@ -198,18 +198,17 @@ class XPBDSprings:
         """
         state = self._state
         for springs in (threads.springs for threads in self._threads if threads.springs.is_damped):
-            for colour in springs.first_colours:
-                damp_threads(springs.on_device, colour, state.nodes, dt, springs.first_colours.step)
+            for bounds in springs.colours:
+                damp_threads(springs.on_device, bounds, state.nodes, dt, springs.at_once)
         for cells in (each for each in self._shears if each.is_damped):
-            for colour in cells.first_colours:
-                damp_shears(cells.on_device, colour, state.nodes, dt, cells.first_colours.step)
+            damp_shears(cells.on_device, cells.bounds, state.nodes, dt, cells.colours)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go, in so many sweeps a cloth."""
         for bends in self._bends:
-            step, nodes = bends.first_colours.step, self._state.nodes
-            for colour in bends.first_colours:
-                solve_bends(bends.on_device, colour, nodes, dt * dt, 1.0 / dt, bends.arity, step)
+            for bounds in bends.colours:
+                numbers = dt * dt, 1.0 / dt, bends.arity, bends.at_once
+                solve_bends(bends.on_device, bounds, self._state.nodes, *numbers)
         for sweep in range(sweeps.max()):
             self._sweep_lists(self._shears, dt, sweeps > sweep, is_first=sweep == 0)
         for threads in self._threads:
@@ -228,7 +227,7 @@ class XPBDSprings:
         for cells in solved:
             if not cloths[list(cells.cloths)].any():
                 continue
-            solve_shears(cells.on_device, self._state.nodes, dt * dt, int(is_first), cells.first_colours.stop)
+            solve_shears(cells.on_device, cells.bounds, self._state.nodes, dt * dt, int(is_first), cells.colours)
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
                 threads.displace(self._state, dt, is_first=is_first)
@@ -265,43 +264,39 @@ def solve_bend(s: ti.i32, springs: SpringArrays, nodes: Nodes, dt_squared: ti.f3
         impulse = -strength * error / (squared * (strength * weight * (1.0 + gamma) + 1.0)) * d
         for a in ti.static(range(arity)):
             i = springs.nodes[arity * s + a]
-            nodes.displacement[i] = (
-                nodes.displacement[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
-            )
+            push = nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
+            nodes.displacement[i] = nodes.displacement[i] + push
 
 
 @kernel
 def solve_bends(
     springs: SpringArrays,
-    colour: ti.i32,
+    bounds: Bounds,
     nodes: Nodes,
     dt_squared: ti.f32,
     rate: ti.f32,
     arity: ti.template(),
     colours: ti.template(),
 ):
-    """The bend springs of so many colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
-    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, colour, colours, 1)
+    """The bend springs of so many colours, within their bounds, one colour after the other; `rate` is 1/dt."""
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = bounds
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for s in range(begin, end):
             solve_bend(s, springs, nodes, dt_squared, rate, arity)
 
 
 @kernel
-def damp_threads(springs: SpringArrays, colour: ti.i32, nodes: Nodes, dt: ti.f32, colours: ti.template()):
+def damp_threads(springs: SpringArrays, bounds: Bounds, nodes: Nodes, dt: ti.f32, colours: ti.template()):
     """Implicit Euler of the forces -tau k dC/dt along the springs of so many colours, one colour after the other, and
     one by one within a piece.
     """
-    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = colour_bounds(springs.piece_of_colour, colour, colours, 1)
+    c_0, c_1, c_2, c_3, c_4, c_5, c_6 = bounds
     for begin, end in ti.static(((c_0, c_1), (c_1, c_2), (c_2, c_3), (c_3, c_4), (c_4, c_5), (c_5, c_6))[:colours]):
         for piece in range(begin, end):
             for s in range(springs.segment_start[piece], springs.segment_start[piece + 1]):
                 i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
                 w_i, w_j, v_i, v_j = nodes.inverse_mass[i], nodes.inverse_mass[j], nodes.velocity[i], nodes.velocity[j]
-                d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32)
-                d += nodes.carry[i] - nodes.carry[j]
+                d = between(i, j, nodes, nodes.carry)
                 squared, strength = d.dot(d), springs.law[s][1] * springs.law[s][2] * dt
                 if squared > TINY_LENGTH * TINY_LENGTH:
                     impulse = -strength / (strength * (w_i + w_j) + 1.0) * d.dot(v_i - v_j) / squared * d

@@ -177,7 +177,7 @@ class ClothJointsCoupling(Coupling):
             self._broken = broken.copy()
             contacts = self._cloth.contacts
             assert contacts is not None
-            contacts.rigid.bodies.set_passing(self._passing[~broken].any(axis=0))
+            contacts.rigid.set_passing(self._passing[~broken].any(axis=0))
 
 
 def points_of_joints(

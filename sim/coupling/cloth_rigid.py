@@ -66,7 +66,7 @@ class ClothRigidCoupling(Coupling):
 
     def resume(self) -> None:
         """Tell the cloth's contacts where the restored bodies are, and how rough they are now."""
-        self._contacts.rigid.bodies.set_friction(self._rigid.surfaces.friction)
+        self._contacts.rigid.set_friction(self._rigid.surfaces.friction)
         self.follow(0.0)
 
 

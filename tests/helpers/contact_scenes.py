@@ -14,7 +14,7 @@ from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision import SelfCollision
 from sim.cloth.solver import ClothSolver
-from sim.cloth.state import ClothState, finish_step
+from sim.cloth.state import finish_step
 from sim.core.world import World
 from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
@@ -54,12 +54,12 @@ def rigid_of(world: World) -> RigidSolver:
     return solver
 
 
-def find(state: ClothState, pairs: SelfCollision) -> ContactList:
+def find(pairs: SelfCollision) -> ContactList:
     """List pairs, and find contacts of cloth with cloth, as a substep does."""
     contacts = ContactList(10**5)
     while True:
         contacts.found.counter.fill(0)
-        pairs.find(state, contacts, 0.1)
+        pairs.find(contacts, 0.1)
         if not pairs.listed.reach_to(int(contacts.found.counter.to_numpy()[1])):
             return contacts
 
@@ -74,7 +74,7 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
     state = solver.state
     state.displacement.from_numpy(displacement.astype(np.float32))
     if solver.contacts is not None:
-        solver.contacts.resolve(state, dt)
+        solver.contacts.resolve(dt)
     allowed = state.displacement.to_numpy().astype(np.float64)
     finish_step(state.nodes, state.position, state.limit, dt, solver._no_reasons)
     return allowed
@@ -133,7 +133,7 @@ def point_triangle_distances(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> 
 
 def listed_places(pairs: SelfCollision, are_edges: bool) -> NDArray[np.int64]:
     """Places of the list where a pair of edges, or of a vertex and a triangle, is, in the order of pairs of patches."""
-    pieces = pairs.listed.on_device.pieces.to_numpy()[: 2 * pairs.patch_pairs.count]
+    pieces = pairs.listed.on_device.pieces.to_numpy()[: 2 * pairs.met.count]
     first, _, found, _ = pieces[int(are_edges) :: 2].T
     return np.concatenate([np.arange(a, a + n) for a, n in zip(first, found, strict=True)])
 

@@ -26,7 +26,7 @@ def threads_in_float64() -> Iterator[None]:
 
 def solve_threads(
     springs: SpringArrays,
-    first: int,
+    bounds: tuple[int, ...],
     nodes: Nodes,
     dt: float,
     is_first: int,
@@ -39,7 +39,7 @@ def solve_threads(
         read(each) for each in (springs.law, springs.shift, work.multiplier, work.tension)
     )
     taut = work.is_taut.to_numpy()
-    for piece, own, chain in pieces_of(springs, first, colours):
+    for piece, own, chain in pieces_of(springs, bounds, colours):
         at_start = -nodes.quantum * np.diff(lattice[chain], axis=0)
         d = at_start - np.diff(u[chain], axis=0)
         length, start_length = (np.linalg.norm(each, axis=1) for each in (d, at_start))
@@ -67,7 +67,7 @@ def solve_threads(
 
 def straighten_threads(
     springs: SpringArrays,
-    first: int,
+    bounds: tuple[int, ...],
     nodes: Nodes,
     dt: float,
     work: ThreadWork,
@@ -76,7 +76,7 @@ def straighten_threads(
 ) -> None:
     w, u, tension = (read(array) for array in (nodes.inverse_mass, nodes.displacement, work.tension))
     predicted = read(nodes.carry) + dt * read(nodes.velocity)
-    for piece, own, chain in pieces_of(springs, first, colours):
+    for piece, own, chain in pieces_of(springs, bounds, colours):
         if work.is_taut[piece]:
             change = np.where(w[chain, None] > 0.0, u[chain] - predicted[chain], 0.0)
             t = tension[own]
@@ -90,10 +90,12 @@ def read(array: Any) -> Floats:
     return values
 
 
-def pieces_of(springs: SpringArrays, first: int, colours: int) -> Iterator[tuple[int, slice, NDArray[np.int32]]]:
+def pieces_of(
+    springs: SpringArrays, bounds: tuple[int, ...], colours: int
+) -> Iterator[tuple[int, slice, NDArray[np.int32]]]:
     """Number, springs and nodes of each piece of some colours, one after the other."""
-    starts, piece_of_colour = springs.segment_start.to_numpy(), springs.piece_of_colour.to_numpy()
+    starts = springs.segment_start.to_numpy()
     ends = springs.nodes.to_numpy().reshape(-1, 2)
-    for piece in range(piece_of_colour[first], piece_of_colour[first + colours]):
+    for piece in range(bounds[0], bounds[colours]):
         own = slice(starts[piece], starts[piece + 1])
         yield piece, own, np.append(ends[own, 0], ends[own][-1, 1])

@@ -274,7 +274,7 @@ def bodies_of(world: World) -> list[tuple[BodyGeometry, Points, Points]]:
     found = []
     for cloth in world.solvers.values():
         if isinstance(cloth, ClothSolver) and cloth.contacts is not None:
-            seen = cloth.contacts.rigid.bodies
+            seen = cloth.contacts.rigid
             places, turns = (
                 each.to_numpy().astype(np.float64) for each in (seen.colliding.position, seen.colliding.rotation)
             )

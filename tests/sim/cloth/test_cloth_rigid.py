@@ -20,7 +20,7 @@ from contact_scenes import SPACE, cloth_of, contacts_of, displace, distances_to_
 from device_distances import measure_distances
 
 from sim.cloth.continuous_contacts import ContinuousContacts
-from sim.cloth.rigid_contact import CollisionBodies, RigidContact
+from sim.cloth.rigid_contact import RigidContact
 from sim.core.motion.paths import Poses
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.body_geometry import BodyGeometry
@@ -42,7 +42,7 @@ def geometry(shape, **keys):
 def test_a_sphere_is_looked_at_within_its_radius_and_not_within_that_of_its_box():
     """Patches of cloth that are farther away are not looked at: with 3^(1/2) times the radius, many near a ball are."""
     box = geometry({"type": "box", "size": (0.2, 0.4, 0.4)})
-    radius = CollisionBodies([geometry(BALL, scale=1.5), box], [0.5, 0.5]).radius.to_numpy()
+    radius = RigidContact([geometry(BALL, scale=1.5), box], [0.5, 0.5], ()).radius.to_numpy()
     np.testing.assert_allclose(radius, [0.075, 0.3], rtol=1e-6)
 
 
@@ -61,7 +61,7 @@ def test_a_sphere_is_looked_at_within_its_radius_and_not_within_that_of_its_box(
 )
 def test_device_has_the_distances_of_the_solids(shape, tolerance):
     body = geometry(shape, scale=1.5)
-    bodies = CollisionBodies([body], [0.5])
+    bodies = RigidContact([body], [0.5], ())
     low, high = 1.3 * body.bounds
     points = np.random.default_rng(0).uniform(low, high, (2000, 3))
     points[0] = 0.0
@@ -121,10 +121,30 @@ def test_what_one_body_pushes_another_holds():
     sheet = {"shape": rectangle((0.004, 0.004), (5, 5)), "thickness": thickness, "friction": 0.0}
     ball = {"shape": {"type": "sphere", "radius": 0.02}, "position": (0.0, 0.0, top + 0.0202)}
     solver = cloth_of(world_of({**sheet, "position": (0.016, 0.0, top + 0.55 * thickness)}, bodies=[ball, TABLE]))
-    contacts_of(solver)._pairs.patch_pairs.budget.margin.fill(1.0)
+    contacts_of(solver)._pairs.moving.margin.fill(1.0)
     moved = displace(solver, np.tile((-0.01, 0.0, 0.0), (25, 1)))
     assert moved[:, 0].max() < -1.0e-3, "it was not led anywhere"
     assert moved[:, 2].min() > -0.15 * thickness  # 0.1 of it was free
+
+
+def test_two_layers_carry_a_heavy_body_and_do_not_enter_it_or_the_floor():
+    """A box of 50 kg comes down on them: the upper layer touches no floor, and the lower one no box."""
+    thickness = 0.5e-3
+    layers = [
+        {"shape": rectangle((0.2, 0.2), (10, 10)), "position": (1e-3 * k, 7e-4 * k, thickness * (k + 0.6))}
+        for k in range(2)
+    ]
+    box = {"kind": "dynamic", "density": 5e4, "shape": {"type": "box", "size": (0.1, 0.1, 0.1)}}
+    world = world_of(*layers, bodies=[{**box, "position": (0.0, 0.0, 0.0563)}])
+    deepest, lowest = 0.0, 0.0
+    for _ in range(15):
+        told = world.advance_frame().diagnostics["cloth"]["bodies_show"]
+        assert told == 0
+        deepest = min(deepest, distances_to_body(world, 0).min())
+        lowest = min(lowest, cloth_of(world).state.positions()[:, 2].min())
+    assert deepest > -0.1 * thickness
+    assert lowest > -0.1 * thickness
+    assert rigid_of(world).bodies.position[0, 2] - 0.05 < 3.0 * thickness, "it was thrown"
 
 
 def test_a_body_that_several_layers_do_not_carry_is_told_and_a_pin_in_a_post_is_not():
@@ -211,10 +231,11 @@ def test_forces_on_both_sides_are_opposite_in_every_substep():
     contacts = contacts_of(solver)
     resolve, differences = contacts.resolve, []
 
-    def weigh(state, dt, *_):
+    def weigh(dt, *_):
+        state = solver.state
         mass, u = state.mass.to_numpy().astype(np.float64)[:, None], state.displacement
         x, before = state.position.to_numpy().astype(np.float64), u.to_numpy().astype(np.float64)
-        resolve(state, dt)  # springs do not change what contacts give
+        resolve(dt)  # springs do not change what contacts give
         impulse = mass * (u.to_numpy().astype(np.float64) - before) / dt
         linear, angular = contacts.take_impulses(dt)
         bodies.apply_impulses(linear, angular)

@@ -8,9 +8,7 @@ import taichi as ti
 from cloth_scenes import WEIGHTLESS, cloth, rectangle, solver_of
 from contact_scenes import find, listed_pairs, listed_places
 
-from sim.cloth.bundles import Ageing
 from sim.cloth.near_pairs import UNKNOWN
-from sim.cloth.patch_pairs import PatchPairs
 from sim.cloth.patches import TRIANGLES_PER_PATCH, Patches
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision import SelfCollision
@@ -35,8 +33,9 @@ def test_patches_share_out_every_element_once_and_know_all_corners():
     )
     host = solver.state.host
     patches = Patches(host)
-    triangles, edges = pieces(patches.triangles, patches.first_triangle), pieces(patches.edges, patches.first_edge)
-    vertices, corners = pieces(patches.vertices, patches.first_vertex), pieces(patches.corners, patches.first_corner)
+    lists, corners = patches.lists, pieces(patches.corners.nodes, patches.corners.first)
+    triangles, edges = pieces(lists.triangles, lists.first_triangle), pieces(lists.edges, lists.first_edge)
+    vertices = pieces(lists.vertices.nodes, lists.vertices.first)
     assert len(triangles) == patches.count > 2
     assert max(len(each) for each in triangles) <= TRIANGLES_PER_PATCH
     for parts, whole in ((triangles, host.triangles), (edges, host.edges.nodes)):
@@ -53,33 +52,23 @@ def test_patches_of_very_uneven_meshes_have_like_numbers_of_triangles():
     """Widths of the strips grow by a thousand; a grid of cells as wide as the widest would hold all the rest in one."""
     state = state_of(33)
     state.host.position[:, 0] = np.repeat(np.geomspace(1e-3, 1.0, 33)[None, :], 33, axis=0).ravel()
-    sizes = np.diff(Patches(state.host).first_triangle.to_numpy())
+    sizes = np.diff(Patches(state.host).lists.first_triangle.to_numpy())
     assert sizes.max() <= TRIANGLES_PER_PATCH
     assert sizes.min() >= TRIANGLES_PER_PATCH // 2
-
-
-def nothing_due(met: PatchPairs) -> ti.Ndarray:
-    """As a list has it in which nothing is listed."""
-    due = ti.ndarray(ti.f32, 2 * met.capacity)
-    due.fill(-1.0e30)
-    return due
 
 
 def approaches(state, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """How much nearer pairs of patches come at most [m], by their motion; the pairs; the corners of the patches."""
     state.displacement.from_numpy(displacement.astype(np.float32))
-    patches = Patches(state.host)
-    met = PatchPairs(patches)
-    met.set_margin(0.0)
-    met.look(state)()
-    collides = ti.ndarray(ti.i32, 1)
-    collides.fill(1)
-    met.meet(1.0, 1.0, collides)
+    pairs = SelfCollision(state)
+    pairs.thickness = pairs.mean_edge = 1.0
+    pairs.look()
+    find(pairs)
+    met, patches = pairs.met, pairs.patches
     # All are searched: none are so far apart that they might sleep.
-    assert met.age(state, Ageing(1.0, 0.0, nothing_due(met))) == met.count
+    assert pairs.expired_count == met.count
     assert met.count == patches.count * (patches.count + 1) // 2
-    corners = pieces(patches.corners, patches.first_corner)
-    return met.on_device.approach.to_numpy()[: met.count], met.on_device.pairs.to_numpy()[: met.count], corners
+    return met.approach.to_numpy()[: met.count], met.pairs.to_numpy()[: met.count], corners_of(pairs)
 
 
 def test_fitted_motion_bounds_how_much_nearer_points_of_patches_come():
@@ -117,22 +106,23 @@ def test_a_cloth_of_one_patch_meets_itself():
     assert bound.tolist() == [0.0]
 
 
-def finish(state, pairs: SelfCollision, predicted: ti.Ndarray | None = None) -> list[int]:
+def finish(pairs: SelfCollision, predicted: ti.Ndarray | None = None) -> list[int]:
     """A substep is over, with displacements that contacts changed from those `predicted`."""
-    is_changed, predicted = predicted is not None, state.displacement if predicted is None else predicted
-    return pairs.finish(state, predicted, ContactList(1), 0, is_changed=is_changed)()
+    is_changed, displacement = predicted is not None, pairs._state.displacement
+    return pairs.finish(predicted or displacement, ContactList(1), 0, is_changed=is_changed)()
 
 
-def crumple(state, pairs: SelfCollision, count: int) -> None:
+def crumple(pairs: SelfCollision, count: int) -> None:
     """Some substeps of a flat sheet whose nodes wander."""
+    state = pairs._state
     generator, x = np.random.default_rng(2), state.host.position.copy()
     for _ in range(count):
         step = generator.uniform(-2e-3, 2e-3, x.shape)
         state.set_positions(x)
         state.displacement.from_numpy(step.astype(np.float32))
-        pairs.look(state)
-        find(state, pairs)
-        finish(state, pairs)
+        pairs.look()
+        find(pairs)
+        finish(pairs)
         x += step
 
 
@@ -141,10 +131,10 @@ def test_frames_that_follow_each_other_search_only_what_has_moved():
     state = state_of(13)
     pairs = SelfCollision(state)
     for expected in (True, False, False):
-        pairs.begin_frame(state)
-        pairs.look(state)
-        find(state, pairs)
-        finish(state, pairs)
+        pairs.begin_frame()
+        pairs.look()
+        find(pairs)
+        finish(pairs)
         assert (pairs.searches > 0.0) == expected
 
 
@@ -152,13 +142,13 @@ def test_cloth_that_is_put_elsewhere_is_searched_anew():
     """As a run is that a checkpoint takes back: displacements say nothing of that motion."""
     state = state_of(13)
     pairs, anew = SelfCollision(state), SelfCollision(state)
-    crumple(state, pairs, 3)
+    crumple(pairs, 3)
     x = np.random.default_rng(3).uniform(-0.06, 0.06, state.host.position.shape)
     state.set_positions(x)
-    pairs.begin_frame(state)
+    pairs.begin_frame()
     for each in (pairs, anew):
-        each.look(state)
-        find(state, each)
+        each.look()
+        find(each)
     assert min(len(each) for each in listed_pairs(anew)) > 100
     assert listed_pairs(pairs) == listed_pairs(anew)
 
@@ -166,14 +156,14 @@ def test_cloth_that_is_put_elsewhere_is_searched_anew():
 def test_changed_thickness_is_searched_anew():
     state = state_of(13)
     pairs = SelfCollision(state)
-    crumple(state, pairs, 1)
+    crumple(pairs, 1)
     state.thickness.fill(0.03)  # beyond the spacing of 25 mm: now neighbours are listed
-    pairs.begin_frame(state)
-    pairs.look(state)
-    find(state, pairs)
+    pairs.begin_frame()
+    pairs.look()
+    find(pairs)
     anew = SelfCollision(state)
-    anew.look(state)
-    find(state, anew)
+    anew.look()
+    find(anew)
     assert pairs.thickness == anew.thickness == np.float32(0.03)
     assert min(len(each) for each in listed_pairs(anew)) > 100
     assert listed_pairs(pairs) == listed_pairs(anew)
@@ -190,13 +180,13 @@ def test_pairs_keep_a_changed_thickness_where_a_thicker_cloth_changes_nothing():
     )
     state, pairs = solver.state, SelfCollision(solver.state)
     for name in ("lower", "upper"):
-        pairs.begin_frame(state)
-        pairs.look(state)
-        find(state, pairs)
+        pairs.begin_frame()
+        pairs.look()
+        find(pairs)
         solver.change(name, thickness=0.004)
-    pairs.begin_frame(state)
-    pairs.look(state)
-    find(state, pairs)
+    pairs.begin_frame()
+    pairs.look()
+    find(pairs)
     assert pairs.thickness == np.float32(0.008)
     listed = pairs.listed.on_device
     for are_edges in (False, True):
@@ -215,16 +205,16 @@ def test_one_wild_vertex_has_only_its_own_surroundings_watched():
     thickness = float(state.thickness.to_numpy().max())
     pairs, predicted = SelfCollision(state), ti.Vector.ndarray(3, ti.f32, 45 * 45)
     predicted.fill(0.0)
-    pairs.look(state)
-    find(state, pairs)
+    pairs.look()
+    find(pairs)
     displacement = np.zeros((45 * 45, 3), dtype=np.float32)
     displacement[0, 2] = 0.02
     state.displacement.from_numpy(displacement)
-    assert finish(state, pairs, predicted) == [0, 1, 0]
-    pairs.look(state)
-    find(state, pairs)
-    allowed = pairs.patch_pairs.on_device.allowed.to_numpy()[: pairs.patch_pairs.count]
-    both = pairs.patch_pairs.on_device.pairs.to_numpy()[: pairs.patch_pairs.count]
+    assert finish(pairs, predicted) == [0, 1, 0]
+    pairs.look()
+    find(pairs)
+    allowed = pairs.met.allowed.to_numpy()[: pairs.met.count]
+    both = pairs.met.pairs.to_numpy()[: pairs.met.count]
     of_wild = np.isin(both, [m for m, corners in enumerate(corners_of(pairs)) if 0 in corners]).any(axis=1)
     assert 0 < np.count_nonzero(of_wild) < len(both) / 20
     np.testing.assert_allclose(allowed[~of_wild & (allowed > 0.0)], thickness, rtol=1e-6)
@@ -233,7 +223,7 @@ def test_one_wild_vertex_has_only_its_own_surroundings_watched():
 
 
 def corners_of(pairs: SelfCollision) -> list[np.ndarray]:
-    return pieces(pairs.patches.corners, pairs.patches.first_corner)
+    return pieces(pairs.patches.corners.nodes, pairs.patches.corners.first)
 
 
 def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
@@ -241,7 +231,7 @@ def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
     roomy, tight = SelfCollision(state), SelfCollision(state)
     for pairs, capacity in ((roomy, 10**5), (tight, 1)):
         pairs.listed.resize(capacity)
-        crumple(state, pairs, 40)
+        crumple(pairs, 40)
     assert min(len(each) for each in listed_pairs(tight)) > 100
     assert listed_pairs(tight) == listed_pairs(roomy)
     assert tight.searches == roomy.searches
@@ -259,33 +249,33 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
         step[:, 2] = generator.uniform(-4e-4, 4e-4, len(x)) + 4e-3 * np.sin(40.0 * x[:, 0])
         state.set_positions(x)
         state.displacement.from_numpy(step.astype(np.float32))
-        before = pairs.patch_pairs.count, pairs.searches
-        pairs.look(state)
+        before = pairs.met.count, pairs.searches
+        pairs.look()
         pairs.looked()
         is_met, known = (
             pairs._is_outrun and before[0] > 0,
-            pairs.patch_pairs.on_device.slack.to_numpy()[: before[0]] > 0.0,
+            pairs.met.slack.to_numpy()[: before[0]] > 0.0,
         )
-        find(state, pairs)
+        find(pairs)
         if is_met:
             meetings += 1
-            carried = pairs.patch_pairs.carried.to_numpy()[: pairs.patch_pairs.count]
+            carried = pairs.carried.to_numpy()[: pairs.met.count]
             assert np.isin(np.flatnonzero(known), carried).mean() > 0.9
             searched.append(pairs.searches - before[1])
             # And what they list is what is there, and what is not near is not missed.
             anew.forget()
-            anew.look(state)
-            find(state, anew)
-            assert near_pairs(state, pairs) == near_pairs(state, anew)
-        finish(state, pairs)
+            anew.look()
+            find(anew)
+            assert near_pairs(pairs) == near_pairs(anew)
+        finish(pairs)
         x += step
     assert meetings >= 2
     assert max(searched) < 0.5 * anew.searches / meetings
 
 
-def near_pairs(state, pairs: SelfCollision) -> list[tuple[int, ...]]:
+def near_pairs(pairs: SelfCollision) -> list[tuple[int, ...]]:
     """What is found in the lists, in an order of its own."""
-    contacts = find(state, pairs)
+    contacts = find(pairs)
     return sorted(map(tuple, contacts.found.vertices.to_numpy()[: contacts.found.counter.to_numpy()[0]].tolist()))
 
 
@@ -296,17 +286,17 @@ def test_patches_are_searched_anew_only_where_cloth_moves():
     x = state.host.position
     at_corner = (x[:, :2] > 0.3).all(axis=1)
     displacement = np.zeros((33 * 33, 3), dtype=np.float32)
-    pairs.look(state)
-    find(state, pairs)
+    pairs.look()
+    find(pairs)
     once = pairs.searches
     generator, height = np.random.default_rng(1), np.zeros(33 * 33)
     for _ in range(30):
         target = np.where(at_corner, generator.uniform(-5e-3, 5e-3, 33 * 33), 0.0)
         displacement[:, 2] = target - height
         state.displacement.from_numpy(displacement)
-        pairs.look(state)
-        find(state, pairs)
-        finish(state, pairs)
+        pairs.look()
+        find(pairs)
+        finish(pairs)
         height = target
         state.set_positions(x + height[:, None] * (0.0, 0.0, 1.0))
     # The corner is a thirtieth of the sheet, and its patches and those beside them are less than a fifth.

@@ -63,11 +63,11 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
         np.repeat([[[0.0, 0.0, 2e-3], [0.0, 0.0, -2e-3]]], 25, axis=0).reshape(50, 3)[:49].astype(np.float32)
     )
     pairs = SelfCollision(state)
-    pairs.look(state)
-    find(state, pairs)
+    pairs.look()
+    find(pairs)
     found, found_edges = listed_pairs(pairs)
     # A pair of patches is searched as far as its own motion asks for, to a thickness at least.
-    reach = pairs.patch_pairs.on_device.reach.to_numpy()[: pairs.patch_pairs.count].max()
+    reach = pairs.met.reach.to_numpy()[: pairs.met.count].max()
     assert reach < 0.1
     triangles = state.host.triangles
     vertex, triangle = (each.ravel() for each in np.mgrid[0:49, 0 : len(triangles)])
@@ -137,8 +137,8 @@ def test_the_plane_of_a_pair_is_between_both_however_near_they_are():
         state.set_positions(np.array(ends) + np.repeat([[4e-6], [0.0]], 4, axis=0) * n + (0.4, -0.3, 0.2))
         state.displacement.fill(0.0)
         pairs = SelfCollision(state)
-        pairs.look(state)
-        contacts = find(state, pairs)
+        pairs.look()
+        contacts = find(pairs)
         count = contacts.found.counter.to_numpy()[0]
         vertices, kinds, normals = (
             each.to_numpy()[:count] for each in (contacts.found.vertices, contacts.found.kind, contacts.found.normal)
@@ -372,8 +372,8 @@ def test_rounds_that_begin_before_contacts_are_counted_change_nothing(monkeypatc
     for world in (waiting, ahead):
         monkeypatch.setattr(continuous_contacts, "runs_on_gpu", lambda world=world: world is ahead)
         contacts = contacts_of(cloth_of(world))
-        begin, begun = contacts._begin_push, []
-        contacts._begin_push = lambda *a, begin=begin, begun=begun, **k: begun.append(k["is_first"]) or begin(*a, **k)
+        weigh, begun = contacts._weigh, []
+        contacts._weigh = lambda weigh=weigh, begun=begun, **k: begun.append(k["is_first"]) or weigh(**k)
         for _ in range(12):
             world.advance_frame()
         searches.append(sum(begun))
@@ -387,9 +387,9 @@ def test_contacts_do_not_depend_on_when_pairs_were_searched_for():
     pairs = contacts_of(cloth_of(anew))._pairs
     look = pairs.look
 
-    def look_anew(state):
+    def look_anew():
         pairs.forget()
-        return look(state)
+        return look()
 
     pairs.look = look_anew
     for _ in range(12):

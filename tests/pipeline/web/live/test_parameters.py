@@ -93,7 +93,7 @@ def test_cloth_feels_how_rough_a_body_has_been_made_also_one_that_rests(tmp_path
     assert "rigid.post.restitution" not in session.parameters  # nothing rebounds
     session.set("rigid.post.friction", 1.5)
     (coupling,) = session.world._couplings
-    assert coupling._contacts.rigid.bodies.colliding.friction.to_numpy().tolist() == [0.5, 1.5]
+    assert coupling._contacts.rigid.colliding.friction.to_numpy().tolist() == [0.5, 1.5]
     saved = load_job(save_job(read, session.values, tmp_path)[0])
     assert [body.friction for body in saved.rigid] == [0.5, 1.5]
 
