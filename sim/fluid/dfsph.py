@@ -99,6 +99,7 @@ class DFSPHSolver(IncompressibleFluid):
             least=LEAST_ITERATIONS,
             tolerance=tolerance,
             aim=self.quiet_error(dt),
+            correction=self.correction(dt),
         )
         self.forces.react(carried["pressure"], dt)
         add_scaled(self.forces.acceleration, self.pressure_acceleration, 1.0, self.particles.count)

@@ -20,6 +20,7 @@ from sim.fluid.pressure import (
     copy_scalars,
     momentum,
     not_negative,
+    not_taken_back,
 )
 from sim.fluid.stepping import SolveRecord
 from sim.fluid.tank import FluidStart
@@ -44,6 +45,7 @@ class Correction(NamedTuple):
     momentum: ti.f32  # share of the last change by which the pressure goes on [-]
     filled_diagonal: ti.f32  # rho0 A_ii of a particle amid a filled lattice [1/m²]
     largest_displacement_squared: ti.f32  # of a prediction [m²]
+    firm_pressure: ti.f32  # up to which all of that share is taken back [Pa]
 
 
 class PCISPHSolver(IncompressibleFluid):
@@ -118,6 +120,7 @@ class PCISPHSolver(IncompressibleFluid):
             aim=self.quiet_error(dt),
             error_growth=error_growth,
             relax=relax,
+            correction=self.correction(dt),
         )
         return record
 
@@ -126,7 +129,8 @@ class PCISPHSolver(IncompressibleFluid):
         fluid = self.tank.on_device
         predict_positions(fluid.particles, self.forces.acceleration, self.pressure_acceleration, dt, self._predicted)
         farthest, response = (LARGEST_DISPLACEMENT * self.spacing) ** 2, self.boundary_response
-        correction = Correction(dt, self.correction(dt), momentum(iteration), self.filled_diagonal, farthest)
+        share, beta = self.correction(dt), momentum(iteration)
+        correction = Correction(dt, share, beta, self.filled_diagonal, farthest, self.firm_pressure)
         correct_pressure(fluid, self.system, self._predicted, response, correction, pressure, self.next_pressure)
 
     def begin_frame(self, time_s: float) -> None:
@@ -189,6 +193,7 @@ def correct_pressure(
         excess = ti.max(particles.density[i] - 1.0, 0.0)
         density = fluid.sigma * (fluid.volume * fluid_sum + boundary_sum)
         left = density - 1.0 - (1.0 - correction.share) * excess
+        left -= not_taken_back(particles.density[i], correction.share, pressure[i], correction.firm_pressure)
         stiffer = ti.min(system.inverse_diagonal[i], fluid.materials.rest_density[own] / correction.filled_diagonal)
         delta = system.relaxation / (dt * dt) * stiffer
         relaxed = not_negative(pressure[i] + delta * left)

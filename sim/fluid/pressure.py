@@ -44,6 +44,7 @@ MOST_ITERATIONS_AHEAD = 4  # most iterations from one look at the error to the n
 DISORDER = 1.3  # largest eigenvalue of A over its diagonal at worst, over that of a lattice; 1.26 is measured
 LEAST_DIAGONAL = 1.0e-6  # of a filled neighbourhood's A_ii: below it a particle has no neighbour and no pressure
 LARGEST_ERROR = 1.0e20  # means of errors beyond it contain one of a particle that is `NOT_FINITE`
+FIRM_PRESSURE = 0.5  # of an expected speed over rho v²: up to it a compression is taken back as fast as may be [-]
 CARE_NEAR_BODIES = 10.0  # how much smaller the error is kept near bodies: it accelerates a light one for many steps
 
 Relax = Callable[[ti.Ndarray, float, int], None]
@@ -74,6 +75,7 @@ class IncompressibleFluid(SPHFluid):
         system: right-hand side, diagonal and what is left.
         relaxation: omega, on the inverse diagonal [-].
         filled_diagonal: rho0 A_ii of a particle amid a filled lattice [1/m²].
+        firm_pressure: up to which the full share of an existing compression is taken back [Pa].
         pressure_acceleration: by the pressure of the last iteration [m/s²], (capacity,) of 3-vectors.
         boundary_response: acceleration of each boundary sample by it [m/s²].
         next_pressure: the pressure to try next [Pa], (capacity,).
@@ -95,6 +97,7 @@ class IncompressibleFluid(SPHFluid):
         self.boundary_response = ti.Vector.ndarray(3, ti.f32, 1)
         self.next_pressure = ti.ndarray(ti.f32, capacity)
         self.system = PressureSystem(*(ti.ndarray(ti.f32, capacity) for _ in range(4)), self.relaxation)
+        self.firm_pressure = FIRM_PRESSURE * float(self.phases.rest_densities.max()) * self.expected_speed**2
         self._least_diagonal = LEAST_DIAGONAL * self.filled_diagonal / float(self.phases.rest_densities.max())
         self._reduction = LaneReduction(maxima=0, sums=1)
         self.body_forces.let_bodies_respond(self.gravity, self.discretization)
@@ -123,7 +126,9 @@ class IncompressibleFluid(SPHFluid):
     def correction(self, dt: float) -> float:
         """Share of the compression a particle has that a step of dt [s] takes back.
 
-        Taken back in one step it would drive particles apart at a speed that grows as the step shrinks.
+        Taken back in one step it would drive particles apart at a speed that grows as the step shrinks. At a pressure
+        above `firm_pressure` it is less, so that it takes no more work: where a closed room has more than its fill, no
+        pressure makes space, and ever more of it would stir the fluid.
         """
         return min(1.0, CORRECTED_PER_CROSSING * self.expected_speed * dt / self.spacing)
 
@@ -159,6 +164,7 @@ class IncompressibleFluid(SPHFluid):
         aim: float | None = None,
         error_growth: float = math.inf,
         relax: Relax | None = None,
+        correction: float = 0.0,
     ) -> ti.Ndarray:
         """P with an error below the tolerance; `pressure_acceleration` is what it causes.
 
@@ -171,6 +177,7 @@ class IncompressibleFluid(SPHFluid):
             aim: that at which it stops, the tolerance if omitted [-].
             error_growth: of the first error, or of ten times the tolerance, at which to give up, not converged [-].
             relax: fills `system.remaining` and `next_pressure`; as the linear system has it if omitted.
+            correction: share of the compression a particle has that `system.compression` counts [-].
         """
         limit = max(self.parameters.max_iterations, least)
         aim = tolerance if aim is None else aim
@@ -179,7 +186,8 @@ class IncompressibleFluid(SPHFluid):
             self.accelerate_by(pressure)
             if relax is None:
                 beta, left = momentum(iteration), (self.pressure_acceleration, self.boundary_response)
-                relax_pressure(self.tank.on_device, self.system, *left, dt**2, beta, pressure, self.next_pressure)
+                tried = correction, self.firm_pressure, pressure, self.next_pressure
+                relax_pressure(self.tank.on_device, self.system, *left, dt**2, beta, *tried)
             else:
                 relax(pressure, dt, iteration)
             iteration += 1
@@ -412,6 +420,12 @@ def accelerate_by_pressure(fluid: Fluid, pressure: Floats, acceleration: Vectors
         )
 
 
+@func
+def not_taken_back(density: ti.f32, correction: ti.f32, pressure: ti.f32, firm_pressure: ti.f32) -> ti.f32:
+    """Of the share `correction` of an existing compression what a step leaves, as it would take too much work."""
+    return correction * ti.max(density - 1.0, 0.0) * (1.0 - firm_pressure / ti.max(pressure, firm_pressure))
+
+
 @kernel
 def relax_pressure(
     fluid: Fluid,
@@ -420,18 +434,21 @@ def relax_pressure(
     boundary_response: Vectors,
     dt_squared: ti.f32,
     momentum: ti.f32,
+    correction: ti.f32,
+    firm_pressure: ti.f32,
     pressure: Floats,
     next_pressure: Floats,
 ):
     """The compression that the accelerations by P leave, and the pressure to try next.
 
-    remaining = s + dt² D a, relaxed = max(P + omega/(dt² A_ii) remaining, 0), next = relaxed + momentum (relaxed -
-    relaxed before), at least 0.
+    remaining = s + dt² D a, without what is `not_taken_back`; relaxed = max(P + omega/(dt² A_ii) remaining, 0), next =
+    relaxed + momentum (relaxed - relaxed before), at least 0.
     """
     ti.loop_config(block_dim=128)
     for i in range(fluid.particles.count):
         rate = density_rate(fluid, i, acceleration, boundary_response)
         left = system.compression[i] + dt_squared * rate
+        left -= not_taken_back(fluid.particles.density[i], correction, pressure[i], firm_pressure)
         relaxed = not_negative(pressure[i] + system.relaxation / dt_squared * system.inverse_diagonal[i] * left)
         next_pressure[i] = not_negative(relaxed + momentum * (relaxed - system.relaxed_before[i]))
         system.relaxed_before[i] = relaxed
