@@ -91,6 +91,13 @@ class SceneParameters(Parameters):
                 ("soft", 0),
                 "meets walls, rigid bodies, fluids and smoke, and would pass through cloth; remove one of both",
             )
+        bodies = {name for body in self.rigid for name in (body.name, body.group)}
+        for number, soft in enumerate(self.soft):
+            for entry, name in enumerate(soft.sticks_to):
+                if name not in bodies:
+                    raise KeyRefusedError(
+                        ("soft", number, "sticks_to", entry), f'"{name}" is the name of no rigid body or group'
+                    )
         return self
 
     @model_validator(mode="after")

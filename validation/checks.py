@@ -16,6 +16,7 @@ TITLES = {
     "rigid": "value",
     "cloth": "value",
     "smoke": "value",
+    "soft": "value",
     "maccormack": "MacCormack",
     "semi_lagrangian": "semi-Lagrangian",
 }

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.core.solver import Coupling
 from sim.shapes.body_geometry import BodyGeometry
-from sim.soft.contact import BodyContacts
+from sim.soft.contact import STICKS, BodyContacts
 
 if TYPE_CHECKING:
     from sim.rigid.parameters import RigidBodyParameters
@@ -37,8 +37,10 @@ def contacts_of_soft(
         return None
     still = [BodyGeometry.of(body.solid) for body in static]
     geometries = [*(() if rigid is None else rigid.solids), *still]
-    own = soft.parameters[0].friction
-    friction = [math.sqrt(own * body.friction) for body in (*moving, *standing)]
+    own, glued = soft.parameters[0].friction, {*soft.parameters[0].sticks_to}
+    friction = [
+        STICKS if glued & {body.name, body.group} else math.sqrt(own * body.friction) for body in (*moving, *standing)
+    ]
     contacts = BodyContacts(geometries, len(moving), friction, mass)
     rotation = np.array([body.solid.rotation for body in static]).reshape(-1, 3, 3)
     position = np.array([body.solid.position for body in static]).reshape(-1, 3)

@@ -8,6 +8,8 @@ the share of the sliding that friction ends, and the body's motion at a node J u
 over the nodes that come nearer gives the change u of the body's motion that all of them together make. Nodes then meet
 the body as it moves afterwards: however light it is, it is not thrown back and forth. What they lose the body gets.
 
+Bodies that it sticks to have t = 1 and hold nodes that lead away as well: then P is the identity.
+
 Sums over nodes are of integers, so that they are the same in any order.
 """
 
@@ -35,6 +37,7 @@ QUANTA = 2.0**56  # of a sum, whose terms are over what they are at most togethe
 TERMS = 27  # of a body's sums: 6 of J'P (v - v_body), 21 of J'P J, its upper triangle
 UPPER = np.triu_indices(6)
 UPPER_PLACE = {(int(row), int(column)): place for place, (row, column) in enumerate(zip(*UPPER, strict=True))}
+STICKS = 1.0e30  # friction against a body that soft matter never leaves, nor slides on [-]
 SLOW = 1.0e-12  # speed along a surface at which there is no direction of it [m/s]
 
 
@@ -62,7 +65,7 @@ class BodyContacts:
     Args:
         geometries: of all bodies, one at least.
         moving: how many of them, the first ones, may move.
-        friction: of soft matter against each body [-].
+        friction: of soft matter against each body [-]; `STICKS` of those that it is glued to.
         mass: of all soft matter, and of what may move along with it [kg].
     """
 
@@ -153,12 +156,13 @@ class BodyContacts:
 
 
 @func
-def body_at(x: ti.math.vec3, touching: Touching) -> ti.i32:
-    """The body that a point is deepest in, or -1."""
+def body_at(x: ti.math.vec3, touching: Touching, cell_size: ti.f32) -> ti.i32:
+    """The body that a point is deepest in, or -1; those that matter sticks to reach out by half a cell."""
     body, least = -1, 0.0
     for b in range(touching.count):
-        if (x - touching.bodies.position[b]).norm() < touching.radius[b]:
-            distance = distance_of(x, b, touching.bodies)
+        glue = ti.select(touching.friction[b] >= STICKS, 0.5 * cell_size, 0.0)
+        if (x - touching.bodies.position[b]).norm() < touching.radius[b] + glue:
+            distance = distance_of(x, b, touching.bodies) - glue
             if distance < least:
                 body, least = b, distance
     return body
@@ -166,10 +170,12 @@ def body_at(x: ti.math.vec3, touching: Touching) -> ti.i32:
 
 @ti.func
 def slid(velocity: ti.math.vec3, normal: ti.math.vec3, friction: ti.f32) -> ti.math.vec3:
-    """A velocity relative to a surface after friction and without what leads into it."""
+    """A velocity relative to a surface after friction and without what leads into it; none where it sticks."""
     into = velocity.dot(normal)
     result = velocity
-    if into < 0.0:
+    if friction >= STICKS:
+        result = ti.math.vec3(0.0)
+    elif into < 0.0:
         along = velocity - into * normal
         result = along * ti.max(0.0, 1.0 + friction * into / ti.max(along.norm(), SLOW))
     return result
@@ -190,15 +196,17 @@ def sum_collisions(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touch
     for n in range(stored * NODES):
         if nodes.mass[n] > 0.0:
             x = place_of_node(n, blocks)
-            body = body_at(x, touching)
+            body = body_at(x, touching, blocks.edge)
             if body >= 0 and touching.is_free[body] == 1:
                 normal = normal_of(x, body, touching.step[body], touching.bodies)
                 velocity = nodes.velocity[n] - velocity_at(x, body, touching.bodies)
                 into = velocity.dot(normal)
-                if into < 0.0:
+                friction = touching.friction[body]
+                if into < 0.0 or friction >= STICKS:
                     along = velocity - into * normal
-                    friction = touching.friction[body]
-                    kept = ti.min(1.0, -friction * into / ti.max(along.norm(), SLOW))
+                    kept = ti.min(1.0, friction * ti.abs(into) / ti.max(along.norm(), SLOW))
+                    if friction >= STICKS:
+                        kept = 1.0
                     mass = nodes.mass[n] / touching.mass_unit
                     arm = (x - touching.bodies.position[body]) / touching.radius[body]
                     stops = mass * (into * normal + kept * along) / touching.speed_unit
@@ -230,7 +238,7 @@ def collide(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touching):
     for n in range(stored * NODES):
         if nodes.mass[n] > 0.0:
             x = place_of_node(n, blocks)
-            body = body_at(x, touching)
+            body = body_at(x, touching, blocks.edge)
             if body >= 0:
                 arm = x - touching.bodies.position[body]
                 frame = velocity_at(x, body, touching.bodies) + touching.gain[body] + touching.turn[body].cross(arm)

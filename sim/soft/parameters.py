@@ -83,6 +83,11 @@ class SoftParameters(Parameters):
         description="Friction against walls and bodies [-], one for all soft bodies; with a body that of the pair is "
         "the root of the product.",
     )
+    sticks_to: tuple[str, ...] = Field(
+        default=(),
+        description="Names of rigid bodies, or groups, that it is glued to where it touches them; "
+        "the same for all soft bodies.",
+    )
     cfl: Positive = Field(default=1.0, le=1.5, description="Factor on the largest stable step [-].")
 
     @model_validator(mode="after")
@@ -148,7 +153,7 @@ def coarse_for_fluid(soft: SoftParameters, spacing: float) -> str | None:
     )
 
 
-SHARED_KEYS = ("cell_size", "friction", "cfl")
+SHARED_KEYS = ("cell_size", "friction", "sticks_to", "cfl")
 """Keys that all soft bodies of a job share, as they share a grid and its steps."""
 
 
@@ -158,10 +163,14 @@ def shared_conflicts(bodies: Sequence[SoftParameters]) -> list[tuple[int, str, s
         (
             number,
             key,
-            f'is {getattr(body, key):g}, but {getattr(bodies[0], key):g} in soft[0] "{bodies[0].name}"; '
+            f'is {_shown(getattr(body, key))}, but {_shown(getattr(bodies[0], key))} in soft[0] "{bodies[0].name}"; '
             "all soft bodies share it",
         )
         for number, body in enumerate(bodies[1:], start=1)
         for key in SHARED_KEYS
         if getattr(body, key) != getattr(bodies[0], key)
     ]
+
+
+def _shown(value: float | tuple[str, ...]) -> str:
+    return f"[{', '.join(value)}]" if isinstance(value, tuple) else f"{value:g}"

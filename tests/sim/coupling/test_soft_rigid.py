@@ -64,6 +64,29 @@ def test_a_ball_as_light_as_a_bubble_rests_in_the_hand_of_jelly_that_flies():
     assert world.solvers["soft"].diagnostics()["max_speed"] < 3.0
 
 
+def test_jelly_carries_off_what_it_sticks_to_and_keeps_its_momentum():
+    jelly = JELLY | {
+        "block": [{"shape": {"type": "box", "size": (0.2, 0.2, 0.2)}, "velocity": (-1.0, 0.0, 0.0)}],
+        "sticks_to": ["ball"],
+    }
+    for sticks in (True, False):
+        loose = jelly if sticks else jelly | {"sticks_to": []}
+        world = world_of(soft=[loose], rigid=[BALL | {"position": (0.155, 0.0, 0.0)}])
+        linear, angular = linear_and_angular(world)
+        for _ in range(15):
+            world.advance_frame()
+        now = linear_and_angular(world)
+        np.testing.assert_allclose(now[0], linear, atol=1e-5 * np.linalg.norm(linear))
+        np.testing.assert_allclose(now[1], angular, atol=1e-5 * 0.1 * np.linalg.norm(linear))
+        together = linear[0] / (world.solvers["soft"].mass + float(world.solvers["rigid"].bodies.mass[0]))
+        assert world.solvers["rigid"].bodies.velocity[0, 0] == pytest.approx(together if sticks else 0.0, abs=0.35)
+
+
+def test_soft_matter_cannot_stick_to_what_is_not_there():
+    with pytest.raises(ValueError, match='"bal" is the name of no rigid body or group'):
+        SceneParameters.model_validate({**SPACE, "soft": [JELLY | {"sticks_to": ["bal"]}], "rigid": [BALL]})
+
+
 @pytest.mark.slow
 def test_a_faster_ball_makes_a_deeper_crater():
     tray = {
