@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Vectors
 from sim.core.host_access import copied
@@ -20,11 +19,16 @@ from sim.soft.transfers import Load, Particles
 
 MAXIMA = 3
 
+FULLNESS = 1.2
+"""Volume of a sample over that of its particle. Samples push by the fluid's pressure alone, where more fluid would push
+by its own as well; with this much, fluid rests 0.4 spacings off a flat face and is displaced as if it were half of one
+(docs/decisions/0075)."""
+
 
 def samples_of_soft(soft: SoftSolver) -> SheetSamples:
-    """A sample for each particle, of its volume at rest."""
+    """A sample for each particle."""
     particles = soft.particles
-    points = BoundarySamples.of_points(copied(particles.position), known=soft.volume)
+    points = BoundarySamples.of_points(copied(particles.position), known=FULLNESS * soft.volume)
     own_mass = copied(soft.masses)[soft.owner].astype(np.float64)
     return SheetSamples(BoundarySamples.of_bodies(points), own_mass, np.zeros(particles.count))
 
@@ -53,13 +57,6 @@ class SoftFluidCoupling(Coupling):
         self._reduction = LaneReduction(maxima=MAXIMA, sums=0)
         soft.let_touch()
         self.follow(0.0)
-
-    def impulse(self) -> NDArray[np.float64]:
-        """Of the fluid on all soft matter in the last step, once `follow` was called [N s], (3,)."""
-        pushed = self._sheets.impulse.to_numpy().sum(axis=0, dtype=np.float64)
-        mass, change = (array.to_numpy().astype(np.float64) for array in (self._sheets.mass, self._change))
-        total: NDArray[np.float64] = pushed - mass @ change
-        return total
 
     def exchange(self, dt: float) -> None:
         """Lay the fluid's impulses of its substep of dt [s], and the fluid that touches, onto the particles."""
