@@ -43,6 +43,13 @@ def emitter_on(
     if emitter.follow not in bodies:
         raise ValueError(f'{name}: no rigid body is named "{emitter.follow}"')
     body = bodies[emitter.follow]
-    if body.whole is not None:
-        raise ValueError(f'{name}: "{emitter.follow}" is a piece of a body that breaks, which no emitter can follow')
+    if problem := follow_problem(body):
+        raise ValueError(f"{name}: {problem}")
     return placed_on(emitter, body) if body.kind == "static" else emitter
+
+
+def follow_problem(body: RigidBodyParameters) -> str | None:
+    """Why no emitter can follow a body, if none can."""
+    if body.whole is None:
+        return None
+    return f'"{body.name}" is a piece of "{body.whole}", which breaks; follow another body'

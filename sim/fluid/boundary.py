@@ -244,15 +244,18 @@ class Boundary:
 
     def _put_movers(self, mover: NDArray[np.generic]) -> None:
         """Of samples whose offsets are put already."""
+        was_alone = np.bincount(self.mover, minlength=self.body_count) == 1
         self.mover = np.asarray(mover, dtype=np.int64)
         order = np.argsort(self.mover, kind="stable")
         put(self.bodies.members, order)
         put(self.bodies.first_member, np.searchsorted(self.mover[order], np.arange(self.body_count + 1)))
         no_body = np.full(self.sheet_count, NO_BODY)
         put(self.bodies.body, np.concatenate([self.mover[self.moving.body], no_body]))
-        self.reach = self._reach()
+        members = np.bincount(self.mover, minlength=self.body_count)
+        self.reach = np.where(was_alone & (members == 1), self.reach, self._reach())
 
     def _reach(self) -> NDArray[np.float64]:
+        """Of bodies whose samples are where they are put; those that deform may get farther."""
         reach = np.zeros(self.body_count)
         distance = np.linalg.norm(self._host_offset.astype(np.float64), axis=1)
         np.maximum.at(reach, self.mover[self.moving.body], distance)

@@ -15,7 +15,7 @@ from pipeline.model.boxes import domain_box, overlap
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path, unknown_name
-from sim.coupling.emitter_bodies import emitter_on
+from sim.coupling.emitter_bodies import emitter_on, follow_problem
 from sim.fluid.opening import Opening, followed
 from sim.fluid.opening_conflicts import opening_problem
 from sim.fluid.parameters import shared_conflicts
@@ -61,6 +61,8 @@ def openings_of(job: Job, index: int, findings: Findings | None = None) -> Itera
         if emitter.follow is not None and emitter.follow not in bodies:
             problem = unknown_name(emitter.follow, bodies, "rigid body", plural="bodies", none="; add [[rigid]]")
             noted.error((*path, "follow"), problem)
+        elif emitter.follow is not None and (piece := follow_problem(bodies[emitter.follow])):
+            noted.error((*path, "follow"), piece)
         elif mesh_exists(emitter.shape, path, noted):
             own = emitter_on(emitter, bodies)
             try:

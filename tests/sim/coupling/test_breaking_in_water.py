@@ -25,7 +25,7 @@ def struck_box(strength: float | None, solver: str = "dfsph") -> Tank:
 
 
 def test_water_moves_what_is_glued_as_it_moves_the_whole(taichi_cpu):
-    """The water is six times as heavy; pieces that answered to it one by one would be thrown off."""
+    """The water is six times as heavy, and its pressure solve has to know what mass gives way."""
     whole, glued = struck_box(None), struck_box(1.0e9)
     for tank in (whole, glued):
         tank.run(0.06)

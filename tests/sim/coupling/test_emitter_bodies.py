@@ -99,9 +99,12 @@ def test_an_emitter_on_a_static_body_stands_with_it(taichi_cpu):
     np.testing.assert_allclose(opening.direction(opening.placement), [-1.0, 0.0, 0.0], atol=1e-12)
 
 
-def test_a_body_that_is_not_there_is_refused(taichi_cpu):
+def test_a_body_that_is_not_there_and_a_piece_of_one_that_breaks_are_refused(taichi_cpu):
     with pytest.raises(ValueError, match=r'fluid "w" emitter\[0\]: no rigid body is named "bottle"'):
         world_of(ON_BOTTLE)
+    breaks = {"kind": "dynamic", "density": 500.0, "breaks": {"strength": 1e6, "pieces": 2}}
+    with pytest.raises(ValueError, match=r'fluid "w" emitter\[0\]: "bottle_1" is a piece of "bottle", which breaks'):
+        world_of({**ON_BOTTLE, "follow": "bottle_1"}, BOTTLE | breaks)
 
 
 @pytest.mark.parametrize("kind", ["kinematic", "dynamic"])
