@@ -50,14 +50,6 @@ class Surface(NamedTuple):
 
 
 @bundle
-class Rest(NamedTuple):
-    """Nodes at rest."""
-
-    cloth: Integers  # number of each node's cloth, (n,)
-    position: Vectors  # [m], (n,)
-
-
-@bundle
 class SpringArrays(NamedTuple):
     """Springs of one family; a piece is one spring where they are solved one by one."""
 
@@ -203,15 +195,6 @@ class PatchLists(NamedTuple):
 
 
 @bundle
-class TrackedNodes(NamedTuple):
-    """Nodes as patches follow them."""
-
-    position: Vectors  # [m], (n,)
-    displacement: Vectors  # [m], (n,)
-    expected: Vectors  # where the substep before should have led [m], (n,)
-
-
-@bundle
 class PatchMotion(NamedTuple):
     """Rigid motion of each patch in the substep, which its displacements are near."""
 
@@ -287,9 +270,11 @@ class PatchPairArrays(NamedTuple):
 
 @bundle
 class Followed(NamedTuple):
-    """Patches and their pairs from substep to substep."""
+    """Nodes, patches and their pairs from substep to substep."""
 
-    nodes: TrackedNodes
+    position: Vectors  # of nodes [m], (n,)
+    displacement: Vectors  # [m], (n,)
+    expected: Vectors  # where the substep before should have led [m], (n,)
     patches: MovingPatches
     met: PatchPairArrays
     thickness: ti.f32  # the largest [m]
@@ -377,7 +362,8 @@ class PairSearch(NamedTuple):
     blocks: PatchBlocks
     listed: PairPieces
     surface: Surface
-    rest: Rest
+    cloth: Integers  # of nodes, (n,)
+    at_rest: Vectors  # where nodes start [m], (n,)
     recovery: ti.f32  # share of a missing distance that the substep gives back [-]
     contacts: Contacts  # which pairs that meet are appended to
 

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations, pairwise
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import PushedNodes, Response
 from sim.cloth.contact_response import STEPS, push, weigh_contacts
+from sim.cloth.parameters import MOST_TURNS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
@@ -23,6 +24,12 @@ from sim.cloth.state import ClothState
 from sim.core.bundles import with_room
 from sim.core.host_access import copied, take
 from sim.core.reductions import LaneReduction, runs_on_gpu
+
+if TYPE_CHECKING:
+    from sim.cloth.explicit import ExplicitSprings
+    from sim.cloth.xpbd import XPBDSprings
+
+RELAXED_BEYOND = 0.03  # excess of a spring [rest lengths] beyond which springs and contacts take another turn
 
 MORE_ITERATIONS = 16
 """Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
@@ -166,7 +173,7 @@ class ContinuousContacts:
     # --- the substep ------------------------------------------------------------------------------------------------
 
     def resolve(
-        self, dt: float, turns: Turns | None = None, conclude: Callable[[ti.Ndarray], None] | None = None
+        self, dt: float, turns: SpringTurns | None = None, conclude: Callable[[ti.Ndarray], None] | None = None
     ) -> bool:
         """Change the displacements of a substep of dt [s], after the springs have, so that nothing crosses; pinned
         nodes stay as they are. Returns whether the step was concluded.
@@ -215,7 +222,7 @@ class ContinuousContacts:
         if self._pairs.meets:
             self._pairs.warm_up()
 
-    def _find(self, dt: float, turns: Turns | None) -> tuple[int, Callable[[], list[int]] | None]:
+    def _find(self, dt: float, turns: SpringTurns | None) -> tuple[int, Callable[[], list[int]] | None]:
         """Number of contacts, or -1 where cloth has no bounds; and a first round of pushes, where that has begun.
 
         It has on a GPU, where there were contacts in the last substep: so the device need not wait for the host.
@@ -244,7 +251,7 @@ class ContinuousContacts:
         motion, _ = self._pairs.looked()
         return math.isfinite(motion) and motion <= 1.0e6
 
-    def _push_in_turns(self, turns: Turns | None, pushed: Callable[[], list[int]] | None) -> None:
+    def _push_in_turns(self, turns: SpringTurns | None, pushed: Callable[[], list[int]] | None) -> None:
         """Push in turns with the springs, for as long as these need them; the first round may have `pushed` already."""
         if pushed is None:
             self._weigh(is_first=True)
@@ -267,7 +274,7 @@ class ContinuousContacts:
         weigh_contacts(self._response, self._state.vertex_count, int(is_first))
 
     def _push(
-        self, turns: Turns | None = None, *, first: int = 0, settles: bool = True, finishes: bool = True
+        self, turns: SpringTurns | None = None, *, first: int = 0, settles: bool = True, finishes: bool = True
     ) -> Callable[[], list[int]]:
         """`STEPS` steps of the contact iteration, from step `first` on, and how long springs are after them; asks for
         what `push` returns.
@@ -317,14 +324,36 @@ class ContinuousContacts:
         return asked()
 
 
-class Turns(Protocol):
-    """Turns that springs take with contacts in a substep."""
+class SpringTurns:
+    """Turns that the springs of some cloths take with contacts in a substep of dt [s].
+
+    Attributes:
+        taken: how many.
+        is_measured: whether it was asked how long springs are.
+    """
+
+    def __init__(self, integrator: XPBDSprings | ExplicitSprings, dt: float, cloths: NDArray[np.bool_]) -> None:
+        self._integrator, self._dt, self._cloths = integrator, dt, cloths
+        self._asked: Callable[[], NDArray[np.float64]] | None = None
+        self.taken, self.is_measured = 0, False
 
     def measure(self) -> None:
-        """Ask how long springs are."""
+        """Ask how long springs are, which the host hears of when it needs to."""
+        self._asked, self.is_measured = functools.cache(self._integrator.excess(self._dt)), True
+
+    @property
+    def excess(self) -> NDArray[np.float64]:
+        """What was measured last [rest lengths], (b,)."""
+        assert self._asked is not None
+        return self._asked()
 
     def relax(self) -> bool:
-        """Let springs change displacements where they were too long when measured; whether they did."""
+        """Solve springs once more if they were too long when measured; whether they were."""
+        if self.taken == MOST_TURNS or self.excess[self._cloths].max(initial=0.0) < RELAXED_BEYOND:
+            return False
+        self.taken += 1
+        self._integrator.sweep(self._dt, self._cloths)
+        return True
 
 
 class ImpactZones:

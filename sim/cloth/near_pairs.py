@@ -254,7 +254,7 @@ def look_at_piece(both: ti.i32, lane: ti.i32, lanes: ti.template(), are_edges: t
 @func
 def look_at_pair(p: ti.i32, both: ti.i32, are_edges: ti.template(), search: PairSearch) -> ti.f32:
     """Append a pair if it has to be; returns when it is due [m]."""
-    listed, met, surface, at_rest = ti.static((search.listed, search.met, search.surface, search.rest.position))
+    listed, met, surface, at_rest = ti.static((search.listed, search.met, search.surface, search.at_rest))
     v, approach, allowed = listed.pairs[p], met.approach[both], met.allowed[both]
     x, u = surface.position[v[0]], surface.displacement[v[0]]
     x1, x2, x3 = surface.position[v[1]] - x, surface.position[v[2]] - x, surface.position[v[3]] - x
@@ -282,7 +282,7 @@ def look_at_pair(p: ti.i32, both: ti.i32, are_edges: ti.template(), search: Pair
         if listed.wanted[p] == UNKNOWN:
             a, b, c, d = at_rest[v[0]], at_rest[v[1]], at_rest[v[2]], at_rest[v[3]]
             apart_at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
-            is_own = search.rest.cloth[v[0]] == search.rest.cloth[v[2]]
+            is_own = search.cloth[v[0]] == search.cloth[v[2]]
             listed.wanted[p] = ti.select(is_own, ti.min(thickness, OF_REST_DISTANCE * apart_at_rest), thickness)
         keeps = part * listed.wanted[p]
         if distance < ti.max(keeps, ti.min(2.0 * motion, approach) + allowed):

@@ -86,7 +86,7 @@ def look_at_patches(
     displacement should have led it [m], both by their bits; how many pairs have to be searched, or -1 if the list does
     not hold; and of how many some elements are due.
     """
-    nodes, patches, met = ti.static((followed.nodes, followed.patches, followed.met))
+    patches, met = ti.static((followed.patches, followed.met))
     motion, tree = ti.static((patches.motion, of_vertices.tree))
     patches_end, pairs_end = workers[0], workers[1]
     met.found[0], met.found[1], met.found[2] = 0, 0, 0
@@ -95,9 +95,9 @@ def look_at_patches(
         for k in range(of_vertices.items):
             i = lane * of_vertices.lane_step + k * of_vertices.item_step
             if i < vertex_count:
-                u = nodes.displacement[i]
+                u = followed.displacement[i]
                 most, least = ti.max(most, u), ti.min(least, u)
-                off = ti.max(off, (nodes.position[i] - nodes.expected[i]).norm_sqr())
+                off = ti.max(off, (followed.position[i] - followed.expected[i]).norm_sqr())
         for axis in ti.static(range(3)):
             tree.partial[axis * tree.lanes + lane] = most[axis]
             tree.partial[(3 + axis) * tree.lanes + lane] = -least[axis]
@@ -132,17 +132,17 @@ def look_at_patches(
 @func
 def fit_motion(m: ti.i32, still: ti.f32, followed: Followed):
     """The box and the motion of a patch; displacements within `still` [m] of each other are not fitted any closer."""
-    nodes, corners = ti.static((followed.nodes, followed.patches.corners))
-    boxes, motion = ti.static((followed.patches.boxes, followed.patches.motion))
+    (patches,) = ti.static((followed.patches,))
+    corners, boxes, motion = ti.static((patches.corners, patches.boxes, patches.motion))
     first, last = corners.first[m], corners.first[m + 1]
-    origin, u_first = nodes.position[corners.nodes[first]], nodes.displacement[corners.nodes[first]]
+    origin, u_first = followed.position[corners.nodes[first]], followed.displacement[corners.nodes[first]]
     least, most, u_least, u_most = origin, origin, u_first, u_first
     # Sums about the first corner: what is subtracted for the mean is of their own size.
     r_sum, u_sum, moment = ti.math.vec3(0.0), ti.math.vec3(0.0), ti.math.vec3(0.0)
     squares, products = ti.math.vec3(0.0), ti.math.vec3(0.0)
     for place in range(first, last):
         i = corners.nodes[place]
-        x, u = nodes.position[i], nodes.displacement[i]
+        x, u = followed.position[i], followed.displacement[i]
         least, most = ti.min(least, x), ti.max(most, x)
         u_least, u_most = ti.min(u_least, u), ti.max(u_most, u)
         if still < LARGEST_STILL:
@@ -165,8 +165,8 @@ def fit_motion(m: ti.i32, still: ti.f32, followed: Followed):
         left, largest = 0.0, 0.0
         for place in range(first, last):
             i = corners.nodes[place]
-            r = nodes.position[i] - x_0
-            left = ti.max(left, (nodes.displacement[i] - u_0 - w.cross(r)).norm_sqr())
+            r = followed.position[i] - x_0
+            left = ti.max(left, (followed.displacement[i] - u_0 - w.cross(r)).norm_sqr())
             largest = ti.max(largest, r.norm_sqr())
     motion.centre[m], motion.shift[m], motion.turn[m] = x_0, u_0, w
     motion.radius[m], motion.rest[m] = ti.sqrt(largest), ti.sqrt(left)
@@ -345,12 +345,12 @@ def measure_change(m: ti.i32, followed: Followed, predicted: Vectors):
 
     The second number that is counted becomes 1 where it is beyond, and the third where it is not finite.
     """
-    nodes, patches, counter = ti.static((followed.nodes, followed.patches, followed.met.found))
+    patches, counter = ti.static((followed.patches, followed.met.found))
     (corners,) = ti.static((patches.corners,))
     squared = 0.0
     for place in range(corners.first[m], corners.first[m + 1]):
         i = corners.nodes[place]
-        squared = ti.max(squared, (nodes.displacement[i] - predicted[i]).norm_sqr())
+        squared = ti.max(squared, (followed.displacement[i] - predicted[i]).norm_sqr())
     patches.change[m] = ti.sqrt(squared)
     if patches.change[m] > patches.margin[m]:
         patches.margin[m] = 1.5 * patches.change[m]
@@ -401,7 +401,6 @@ def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, follo
     of the nearest two vertices, keeps 1 - `LARGEST_SHARE` of what it was; or all of it where it was none.
     `crossing` gets 1 for pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
     """
-    (nodes,) = ti.static((followed.nodes,))
     tested.crossing[c] = 0
     mobile = 0.0
     for k in ti.static(range(4)):
@@ -409,13 +408,13 @@ def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, follo
     if contacts.kind[c] < 0 and contacts.kind[c] >= EDGE_EDGE and mobile > 0.0:
         n, v = contacts.normal[c], contacts.vertices[c]
         first = ti.select(contacts.kind[c] == EDGE_EDGE, 2, 1)
-        origin, size = nodes.position[v[0]], 0.0
+        origin, size = followed.position[v[0]], 0.0
         start, end = ti.math.vec4(0.0), ti.math.vec4(0.0)
         for k in ti.static(range(4)):
-            x = nodes.position[v[k]] - origin
+            x = followed.position[v[k]] - origin
             start[k] = n.dot(x)
-            end[k] = start[k] + n.dot(nodes.displacement[v[k]])
-            size = ti.max(size, x.norm(), (nodes.displacement[v[k]] - nodes.displacement[v[0]]).norm())
+            end[k] = start[k] + n.dot(followed.displacement[v[k]])
+            size = ti.max(size, x.norm(), (followed.displacement[v[k]] - followed.displacement[v[0]]).norm())
         low, low_start, high, high_start = 1.0e30, 1.0e30, -1.0e30, -1.0e30
         lowest, highest = 0, 0
         for k in ti.static(range(4)):
@@ -470,8 +469,8 @@ def end_contacts(
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement
     is not finite.
     """
+    patches, met = ti.static((followed.patches, followed.met))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    nodes, patches, met = ti.static((followed.nodes, followed.patches, followed.met))
     contacts_end, vertices_end = count, vertex_count
     displaced_end, patches_end, pairs_end = workers[0], workers[1], workers[2]
     met.found[0], met.found[1], met.found[2] = 0, 0, 0
@@ -486,7 +485,7 @@ def end_contacts(
             m = next_item(m, worker, met.taken, 0, PATCHES_AT_A_TIME)
     for i in range(vertices_end):
         if met.found[0] + met.found[1] + met.found[2] == 0:
-            nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
+            followed.expected[i] = followed.position[i] + followed.displacement[i]
     begin_sharing(met.taken, 1)
     for worker in range(patches_end):
         stop = ti.select(met.found[0] + met.found[1] + met.found[2] == 0, patches.corners.count, 0)

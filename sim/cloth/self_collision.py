@@ -22,9 +22,7 @@ from sim.cloth.bundles import (
     PairSearch,
     PatchMotion,
     PatchPairArrays,
-    Rest,
     TestedContacts,
-    TrackedNodes,
     Two,
 )
 from sim.cloth.near_pairs import NEVER, carry_pieces, find_near_pairs, keep_pairs, range_of_vectors
@@ -183,8 +181,8 @@ class SelfCollision:
             boxes=with_room(Boxes, m),
             motion=with_room(PatchMotion, m),
         )
-        self._nodes = TrackedNodes(state.position, state.displacement, ti.Vector.ndarray(3, ti.f32, n))
-        self._rest, self._blocks = Rest(state.body, on_device(host.position)), blocks_of(self.patches)
+        self._expected = ti.Vector.ndarray(3, ti.f32, n)
+        self._at_rest, self._blocks = on_device(host.position), blocks_of(self.patches)
         self._tree: BoxTree = with_room(BoxTree, 2 * self.patches.leaves, leaves=self.patches.leaves)
         self._taken, self._found = (ti.ndarray(ti.i32, 4) for _ in range(2))
         self._first_known, self._needed = ti.ndarray(ti.i32, 2 * max(m, 1)), ti.ndarray(ti.i32, max(m, 1))
@@ -240,7 +238,8 @@ class SelfCollision:
 
     @property
     def _followed(self) -> Followed:
-        return Followed(self._nodes, self.moving, self.met, self.thickness, self._astray)
+        nodes = self._state.position, self._state.displacement, self._expected
+        return Followed(*nodes, self.moving, self.met, self.thickness, self._astray)
 
     def look(self) -> None:
         """Note how cloth moves in this substep."""
@@ -365,7 +364,8 @@ class SelfCollision:
                 self._blocks,
                 self.listed.on_device,
                 self._state.surface,
-                self._rest,
+                self._state.body,
+                self._at_rest,
                 recovery,
                 contacts.found,
             ),

@@ -1,7 +1,6 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir, push_nodes
 from sim.cloth.cells import cells_of
-from sim.cloth.continuous_contacts import ContinuousContacts
+from sim.cloth.continuous_contacts import ContinuousContacts, SpringTurns
 from sim.cloth.device_cells import DeviceCells
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
@@ -18,7 +17,6 @@ from sim.cloth.parameters import (
     DEFAULT_SUBSTEPS,
     MOST_REFINED,
     MOST_SWEEPS,
-    MOST_TURNS,
     RUNAWAY_SPEED,
     ClothParameters,
     shared_conflicts,
@@ -41,47 +39,15 @@ SOLVER_NAME = "cloth"
 
 INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 
-REFINED_BEYOND, RELAXED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.03, 0.02, 0.035
-"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; beyond
-which springs and contacts take another turn; below which sweeps go back, and below which steps do: turns end between
-both. It falls with every turn and sweep, and with the square of the step."""
+REFINED_BEYOND, RESTORED_BELOW, LENGTHENED_BELOW = 0.05, 0.02, 0.035
+"""Excess of a spring [rest lengths] beyond which the next step has twice as many sweeps, or half the length; below
+which sweeps go back, and below which steps do: turns end between both (`RELAXED_BEYOND`). It falls with every turn and
+sweep, and with the square of the step."""
 
 FIXED_KEYS = frozenset(
     ("name", "shape", "position", "rotation_deg", "velocity", "material", "pin", "integrator", "substeps", "iterations")
 )
 """What cannot change between frames; all else can."""
-
-
-class SpringTurns:
-    """Turns that the springs of some cloths take with contacts in a substep of dt [s].
-
-    Attributes:
-        taken: how many.
-        is_measured: whether it was asked how long springs are.
-    """
-
-    def __init__(self, integrator: XPBDSprings | ExplicitSprings, dt: float, cloths: NDArray[np.bool_]) -> None:
-        self._integrator, self._dt, self._cloths = integrator, dt, cloths
-        self._asked: Callable[[], NDArray[np.float64]] | None = None
-        self.taken, self.is_measured = 0, False
-
-    def measure(self) -> None:
-        """Ask how long springs are, which the host hears of when it needs to."""
-        self._asked, self.is_measured = functools.cache(self._integrator.excess(self._dt)), True
-
-    @property
-    def excess(self) -> NDArray[np.float64]:
-        """What was measured last [rest lengths], (b,)."""
-        assert self._asked is not None
-        return self._asked()
-
-    def relax(self) -> bool:
-        """Solve springs once more if they were too long when measured; whether they were."""
-        if self.taken == MOST_TURNS or self.excess[self._cloths].max(initial=0.0) < RELAXED_BEYOND:
-            return False
-        self.taken += 1
-        self._integrator.sweep(self._dt, self._cloths)
-        return True
 
 
 class ClothSolver:

@@ -210,21 +210,18 @@ class XPBDSprings:
                 numbers = dt * dt, 1.0 / dt, bends.arity, bends.at_once
                 solve_bends(bends.on_device, bounds, self._state.nodes, *numbers)
         for sweep in range(sweeps.max()):
-            self._sweep_lists(self._shears, dt, sweeps > sweep, is_first=sweep == 0)
+            self.sweep(dt, sweeps > sweep, shears=self._shears, is_first=sweep == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
         self._momentum.restore(dt)
 
-    def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
-        """Solve what bears tension in some cloths once more, after contacts have pushed: threads, and the triangles of
-        meshes."""
-        self._sweep_lists([], dt, cloths, is_first=False)
-
-    def _sweep_lists(
-        self, solved: Sequence[DeviceCells], dt: float, cloths: NDArray[np.bool_], *, is_first: bool
+    def sweep(
+        self, dt: float, cloths: NDArray[np.bool_], *, shears: Sequence[DeviceCells] = (), is_first: bool = False
     ) -> None:
-        """Lists hold only cloths that take the same sweeps."""
-        for cells in solved:
+        """Solve what bears tension in some cloths, once more after contacts have pushed: threads, and the triangles of
+        meshes; and shears if they are given. Lists hold only cloths that take the same sweeps.
+        """
+        for cells in shears:
             if not cloths[list(cells.cloths)].any():
                 continue
             solve_shears(cells.on_device, cells.bounds, self._state.nodes, dt * dt, int(is_first), cells.colours)

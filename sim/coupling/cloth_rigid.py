@@ -35,7 +35,7 @@ class ClothRigidCoupling(Coupling):
     and angular momentum are kept to rounding. Kinematic bodies push and feel nothing.
 
     Approximate: contacts among bodies in the same step are not foreseen. Cloth carries a heavy body over what stands
-    (`sim.cloth.contact_response`), but gives way between two bodies that both move, or in several layers.
+    (`sim.cloth.contact_response`), in two layers, too, but gives way between two bodies that both move, or in more.
 
     """
 
