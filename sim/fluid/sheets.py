@@ -35,7 +35,7 @@ DIVERGENCE, DENSITY = 0, 1  # solves of a step whose forces last apart: of diver
 STEPS_REMEMBERED = 2  # after which arrays that took turns hold forces of the time alone
 FULL_CONTACT = 0.5  # of the density that samples give to fluid at rest beside them: with it a particle touches in full
 STANDOFF = 0.5  # distance from a sheet at which the first layer of a fluid is at rest [spacings], as at a wall
-AMID_SAMPLES = 1.5  # density in the middle of a sheet by its samples alone, as in the face of a wall
+AMID_SAMPLES = 2.0  # density in the middle of a sheet by its samples alone; in the face of a wall 1.5
 
 
 @bundle
@@ -62,8 +62,8 @@ class SheetSamples:
 def sheet_depth(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     """How far behind a sheet, seen from either side, its samples are felt [spacings].
 
-    As deep as a wall's lie at a support of two spacings, 0.95. Of a wider one a single layer there would not keep out
-    what moves alone: farther off its density rises more steeply towards the sheet.
+    A wall's lie 0.95 deep. Farther off their density rises more steeply towards the sheet, which has nothing behind it
+    that would hold what has once got into it.
     """
 
     def excess(depth: float) -> float:

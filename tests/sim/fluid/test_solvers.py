@@ -124,6 +124,7 @@ def test_every_solve_of_a_dam_break_converges_and_nobody_leaks(dam_break, solver
 @BOTH
 def test_a_solve_that_hits_its_limit_is_counted(dam_break, solver):
     fluid = dam_break(solver=solver, density_tolerance=1e-9, divergence_tolerance=1e-9, max_iterations=4, dt=1e-3)
+    steps(fluid, 5)  # the first ones leave the lattice as it is
     fluid.begin_frame(0.0)
     steps(fluid, 5)
     state = fluid.diagnostics()
