@@ -44,7 +44,7 @@ MOST_ITERATIONS_AHEAD = 4  # most iterations from one look at the error to the n
 DISORDER = 1.3  # largest eigenvalue of A over its diagonal at worst, over that of a lattice; 1.26 is measured
 LEAST_DIAGONAL = 1.0e-6  # of a filled neighbourhood's A_ii: below it a particle has no neighbour and no pressure
 LARGEST_ERROR = 1.0e20  # means of errors beyond it contain one of a particle that is `NOT_FINITE`
-FIRM_PRESSURE = 0.5  # of an expected speed over rho v²: up to it a compression is taken back as fast as may be [-]
+FIRM_PRESSURE = 1.0  # over rho v² of the expected speed, twice what still fluid has: full correction up to it [-]
 CARE_NEAR_BODIES = 10.0  # how much smaller the error is kept near bodies: it accelerates a light one for many steps
 
 Relax = Callable[[ti.Ndarray, float, int], None]

@@ -35,7 +35,7 @@ DIVERGENCE, DENSITY = 0, 1  # solves of a step whose forces last apart: of diver
 STEPS_REMEMBERED = 2  # after which arrays that took turns hold forces of the time alone
 FULL_CONTACT = 0.5  # of the density that samples give to fluid at rest beside them: with it a particle touches in full
 STANDOFF = 0.5  # distance from a sheet at which the first layer of a fluid is at rest [spacings], as at a wall
-AMID_SAMPLES = 1.5  # density in the middle of a sheet by its samples alone, as in the face of a wall
+AMID_SAMPLES = 2.0  # density in the middle of a sheet by its samples alone; in the face of a wall 1.5
 
 
 @bundle
@@ -62,8 +62,8 @@ class SheetSamples:
 def sheet_depth(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     """How far behind a sheet, seen from either side, its samples are felt [spacings].
 
-    As deep as a wall's lie at a support of two spacings, 0.95. Of a wider one a single layer there would not keep out
-    what moves alone: farther off its density rises more steeply towards the sheet.
+    A wall's lie 0.95 deep. Farther off their density rises more steeply towards the sheet, which has nothing behind it
+    that would hold what has once got into it.
     """
 
     def excess(depth: float) -> float:
@@ -89,17 +89,20 @@ def resting_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
 def kept_away(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     """How much farther from a sheet fluid on both sides of it is at rest than on one [spacings].
 
-    What is on one side feels what is on the other, and the sheet as well.
+    What is on one side is pushed by what is on the other, and by the sheet as well. Under an even pressure both push as
+    much as the fluid on its own side does, a sample with half of what a particle has (`wall_calibration`).
     """
     volume, depth = volume_per_area(support_in_spacings), sheet_depth(support_in_spacings)
+    particle = 2.0 * particle_volume(1.0, support_in_spacings)
+
+    def push(nearest: float) -> float:
+        layers = np.arange(nearest, support_in_spacings)
+        return particle * sum(layer_field(float(distance), support_in_spacings)[1] for distance in layers)
 
     def excess(gap: float) -> float:
-        layers = np.arange(2.0 * gap, support_in_spacings)
-        beyond = sum(layer_field(float(distance), support_in_spacings)[0] for distance in layers)
-        own = volume * layer_field(depth + gap, support_in_spacings)[0]
-        return own + particle_volume(1.0, support_in_spacings) * beyond - resting_field(support_in_spacings)
+        return volume * layer_field(depth + gap, support_in_spacings)[1] + push(2.0 * gap) - push(1.0)
 
-    return float(brentq(excess, STANDOFF, 1.0)) - STANDOFF
+    return float(brentq(excess, 0.4, 1.1)) - STANDOFF
 
 
 def one_sided_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
