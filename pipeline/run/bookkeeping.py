@@ -72,6 +72,11 @@ class RunRecord:
         )
         return assignment
 
+    @property
+    def begun(self) -> list[tuple[ArtifactPath, int]]:
+        """Outputs of the attempts of this run, each with the number of the last one of its task."""
+        return [(output, each.attempt) for each in self._assignments.values() for output in each.task.outputs]
+
     def take(self, event: TaskEvent, *, lacking: Callable[[TaskId], Sequence[ArtifactPath]]) -> list[Settled]:
         """Put an event of an attempt on record.
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from pipeline.base.errors import DamagedManifestError, DiskFullError, PlanError
+from pipeline.base.errors import DamagedManifestError, DiskFullError, LeaseLostError, PlanError
 from pipeline.base.files import holds, replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
@@ -33,7 +33,7 @@ from pipeline.run.goal import write_goal
 from pipeline.run.plan import Assessment, Verdict, assess, frame_turns, plan_job, up_to_date
 from pipeline.run.scheduler import Scheduler
 from pipeline.run.sharing import Shared, take_over_shared
-from pipeline.store.artifacts import sweep_parts
+from pipeline.store.artifacts import remove_parts_of, sweep_parts
 from render.temporary_folder import remove_folders_of_the_dead
 
 _TURN_S = 0.25
@@ -216,6 +216,10 @@ class _Run:
             if self.record.parts_left:
                 sweep_parts(self.layout)
             self.manifest.end_run(self.ending, clean=not self.record.ended_by_force)
+        except LeaseLostError:
+            self.executor.shutdown()
+            remove_parts_of(self.layout, self.record.begun)
+            raise
         except OSError as error:
             if not is_disk_full(error):
                 raise

@@ -29,7 +29,7 @@ import platform
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,6 +212,17 @@ def sweep_parts(layout: JobLayout) -> list[Path]:
                 path.unlink(missing_ok=True)
                 swept.append(path)
     return sorted(swept)
+
+
+def remove_parts_of(layout: JobLayout, attempts: Iterable[tuple[ArtifactPath, int]]) -> None:
+    """Remove what dead attempts left of their outputs, each given with the attempt's number, which no other has.
+
+    For a run whose job was taken over: its last write may have hung until after the other run had swept.
+    """
+    for artifact, attempt in attempts:
+        for path in (layout.path(artifact), layout.receipt(artifact)):
+            with suppress(OSError):  # the folder may be gone; the job is another run's, which goes on without
+                _part_path(path, attempt).unlink(missing_ok=True)
 
 
 def _fence(layout: JobLayout, receipt: Receipt) -> None:

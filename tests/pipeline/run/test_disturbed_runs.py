@@ -94,8 +94,12 @@ def test_a_run_whose_lease_was_taken_over_stops(root, monkeypatch):
     monkeypatch.setattr("pipeline.base.lease.HEARTBEAT_INTERVAL_S", 0.01)
     write_faults(root, {}, pause_s=0.1)
     lease = JobLayout(root).lease
+    ours = [root / ".receipts/steps/.000005.bin.json.part.1", root / "steps/.000005.bin.part.1"]
+    theirs = root / "steps/.000005.bin.part.2"
 
     def take_over_from_elsewhere(_: Committed) -> None:
+        for part in (*ours, theirs):  # written by a call that hung until the other run had swept
+            part.touch()
         holder = json.loads(lease.read_text())
         part = lease.with_name("new.lease")
         part.write_text(json.dumps(holder | {"token": "another", "host": "elsewhere"}))
@@ -104,6 +108,7 @@ def test_a_run_whose_lease_was_taken_over_stops(root, monkeypatch):
     with InlineExecutor() as executor, pytest.raises(LeaseLostError, match=r"taken over by process \d+ on elsewhere"):
         run_synthetic(root, executor, observers=[Reacting(Committed, take_over_from_elsewhere).notify])
     assert lease.exists()
+    assert ([part for part in ours if part.exists()], theirs.exists()) == ([], True)
 
 
 @pytest.mark.parametrize("executor", [InlineExecutor, ProcessExecutor])
