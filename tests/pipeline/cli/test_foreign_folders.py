@@ -2,7 +2,7 @@
 
 import shutil
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -24,7 +24,7 @@ OF_QUEUE = {"pause", "cancel", "priority"}
 
 WRITERS = {
     "submit": [["{file}", "--farm", "{farm}"], ["{job}/job.toml"]],
-    "sweep": [["{file}", "--farm", "{farm}", "--set", "frames=1,2"]],
+    "sweep": [["{file}", "--farm", "{farm}", "--set", "frames=1,2", "--executor", "inline"]],
     "rerun": [["{job}", "--failed"], ["{job}", "--stage", "render"]],
     "resume": [["{job}"]],
     "work": [["{job}", "--stage", "simulate"], ["{job}", "--stage", "render"]],
@@ -52,18 +52,19 @@ LINKS = (
 )
 
 
-@pytest.fixture(autouse=True)
-def drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def drawing() -> Iterator[None]:
     """Films take a moment: most commands that are called make what is spoilt anew."""
-    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES_WITH_CACHE)
-    monkeypatch.setattr("pipeline.queue.turns.STAGES_REFERENCE", drawing_stages.WITH_CACHE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES_WITH_CACHE)
+        patch.setattr("pipeline.queue.turns.STAGES_REFERENCE", drawing_stages.WITH_CACHE)
+        yield
 
 
-@pytest.fixture
-def finished(tmp_path: Path, drawing: None) -> Path:
-    """The folder of a finished job."""
-    file = tmp_path / "finished" / "synthetic.toml"
-    file.parent.mkdir()
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, drawing: None) -> Path:
+    """The folder of a finished job, of which each call has a copy."""
+    file = tmp_path_factory.mktemp("finished") / "synthetic.toml"
     file.write_text(job_text(frames=2))
     ended = pipeline("submit", file, "--farm", file.parent, "--executor", "inline")
     assert ended.exit_code == 0, ended.output
