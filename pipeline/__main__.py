@@ -1,6 +1,11 @@
 """`python -m pipeline`, and the command `pipeline`."""
 
+import os
 import signal
+
+from pipeline.base.threads import BLAS_THREADS
+
+os.environ.update(BLAS_THREADS)  # before anything loads numpy
 
 _HANDLER = signal.getsignal(signal.SIGINT)
 if _HANDLER is signal.default_int_handler:

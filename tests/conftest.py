@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from pipeline.base.threads import BLAS_THREADS
+
 VALIDATION_CASES = "tests/validation/test_validation_cases.py"
 """Of all solvers, and long: a family of its own."""
 
@@ -40,6 +42,7 @@ def keep_bytecode() -> None:
 
 if sys.dont_write_bytecode:
     keep_bytecode()
+os.environ.update(BLAS_THREADS)  # as the command line does, before numpy is loaded
 
 
 def family_of(nodeid: str) -> str:

@@ -103,11 +103,11 @@ def overrides_option(example: str) -> Callable[[Any], Any]:
 def claim_cores(cores: int | None) -> Resources:
     """What one task in this process may use; tells the libraries that count cores for themselves."""
     from pipeline.base.resources import machine_capacity
-    from pipeline.run.executors.worker_process import THREAD_VARIABLES
+    from pipeline.base.threads import thread_variables
 
     capacity = machine_capacity(gpus=1)
     capacity = replace(capacity, cores=min(cores or capacity.cores, capacity.cores))
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(capacity.cores)))  # before anything reads them
+    os.environ.update(thread_variables(capacity.cores))  # before anything reads them
     return capacity
 
 

@@ -16,9 +16,10 @@ from typing import Self
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, TaskId, TaskState
+from pipeline.base.threads import thread_variables
 from pipeline.model.job import Job
 from pipeline.run.events import Committed, JobOutcome, RunEnded, RunEvent, RunStarted, StateChanged
-from pipeline.run.executors.worker_process import THREAD_VARIABLES, python_argv
+from pipeline.run.executors.worker_process import python_argv
 from pipeline.run.plan import NEVER_MADE, Assessment, Verdict
 
 SHARE = 0.05
@@ -177,7 +178,7 @@ class PreviewMovie:
                 encoding="utf-8",
                 errors="replace",
                 process_group=0,  # Ctrl-C is for the runner
-                env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, "1")},
+                env={**os.environ, **thread_variables(1)},
             )
         with self._child as child:
             assert child.stdout is not None

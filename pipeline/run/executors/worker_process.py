@@ -17,6 +17,7 @@ import psutil
 from pipeline.base.files import make_folder
 from pipeline.base.memory import machine_memory_bytes, out_of_memory_kills, process_tree, tree_memory_bytes
 from pipeline.base.task import FailureKind
+from pipeline.base.threads import thread_variables
 from pipeline.run.events import Failed, Progress
 from pipeline.run.executors.base import Assignment
 from pipeline.run.executors.channel import Channel
@@ -24,7 +25,6 @@ from pipeline.run.executors.failures import means_gpu_error
 from pipeline.run.executors.worker import STACK_DUMP_SIGNAL
 from render.temporary_folder import environment_of_child
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 PREPARATION_S = 4 * 3600.0
 """How long a worker may be silent while it prepares what is done once on a machine, such as Cycles' kernels [s]."""
 _LOG_TAIL_LINES = 20
@@ -224,7 +224,7 @@ def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, ExitSta
             stderr=log,
             pass_fds=[theirs.fileno()],
             start_new_session=True,
-            env={**environment, **dict.fromkeys(THREAD_VARIABLES, str(first.threads))},
+            env={**environment, **thread_variables(first.threads)},
         )
         on_failure.pop_all()
     return process, Channel(ours), scratch

@@ -283,7 +283,8 @@ class TestProcesses(ProcessesContract):
         write_faults(layout.root, {"film": ["hang"]})
         executor.submit(assign(layout, "film", threads=3))
         assert any(isinstance(event, Started) for event in executor.wait(PATIENCE_S))
-        assert psutil.Process(executor.worker_pids[0]).environ()["OMP_NUM_THREADS"] == "3"
+        environment = psutil.Process(executor.worker_pids[0]).environ()
+        assert (environment["OMP_NUM_THREADS"], environment["OPENBLAS_NUM_THREADS"]) == ("3", "1")
 
     def test_a_long_assignment_does_not_block_the_supervisor(self, executor, layout):
         """Larger than any socket buffer, to a worker that has not begun to read."""
