@@ -21,7 +21,8 @@ from sim.shapes.placement import build_solid
 if TYPE_CHECKING:
     from sim.shapes.placement import PlacedSolid
 
-DRAWS = 64  # of a source's box for each ember, before its shape counts as empty
+PLACES = 4096  # in each source, of which every ember takes one
+DRAWS = 64  # of a source's box for each of them, before its shape counts as empty
 STATE = ("position", "velocity", "age", "life", "diameter", "number")
 
 
@@ -74,8 +75,12 @@ class EmberSolver:
     ) -> None:
         self.name, self.parameters, self.gravity = parameters.name, parameters, gravity
         self._frame_s = 1.0 / frames_per_second
-        self._solids = [build_solid(source) for source in parameters.source]
-        n = parameters.most
+        self._places = [
+            _places_in(build_solid(source), np.random.default_rng((parameters.seed, index)))
+            for index, source in enumerate(parameters.source)
+        ]
+        # Embers of a frame take their places when it begins, beside all that glow then.
+        n = parameters.most + sum(math.ceil(source.rate * self._frame_s) + 1 for source in parameters.source)
         self.embers = Embers(
             *(ti.Vector.ndarray(3, ti.f32, n) for _ in range(2)),
             *(ti.ndarray(ti.f32, n) for _ in range(3)),
@@ -112,9 +117,9 @@ class EmberSolver:
             chance = np.random.default_rng((self.parameters.seed, index, low))
             count = high - low
             numbers = first + np.arange(count)
-            rows = numbers % self.parameters.most
+            rows = numbers % len(arrays["number"])
             shares = chance.uniform(LEAST_SHARE, MOST_SHARE, (2, count))
-            arrays["position"][rows] = _places(self._solids[index], count, chance)
+            arrays["position"][rows] = chance.choice(self._places[index], count)
             arrays["velocity"][rows] = source.velocity + source.spread * chance.standard_normal((count, 3))
             arrays["age"][rows] = time_s - (source.start_s + np.arange(low, high) / source.rate)
             arrays["life"][rows] = self.parameters.lifetime * shares[0]
@@ -175,14 +180,16 @@ class EmberSolver:
         return f"{bad} embers have a position that is not finite" if bad else None
 
 
-def _places(solid: "PlacedSolid", count: int, chance: np.random.Generator) -> NDArray[np.float64]:
-    """Random places in a solid [m], (count, 3)."""
+def _places_in(solid: "PlacedSolid", chance: np.random.Generator) -> NDArray[np.float64]:
+    """Random places in a solid [m], (PLACES, 3)."""
     low, high = solid.bounds
-    drawn = chance.uniform(low, high, (DRAWS * count, 3))
-    inside = drawn[solid.signed_distance(drawn) < 0.0]
-    if len(inside) < count:
+    found, drawn = np.empty((0, 3)), 0
+    while len(found) < PLACES and drawn < DRAWS:
+        points = chance.uniform(low, high, (PLACES, 3))
+        found, drawn = np.concatenate([found, points[solid.signed_distance(points) < 0.0]]), drawn + 1
+    if len(found) < PLACES:
         raise ValueError("a source of embers has hardly any inside")
-    return inside[:count]
+    return found[:PLACES]
 
 
 @kernel

@@ -92,6 +92,22 @@ def test_they_come_at_their_rate_from_inside_their_source_and_grow_cold():
     assert made.solvers["sparks"].embers.number.to_numpy().max() == 89
 
 
+def test_none_gives_its_place_to_another_before_it_is_cold():
+    made = world(source={"rate": 3000.0}, lifetime=0.05)
+    embers = made.solvers["sparks"].embers
+    for _ in range(12):
+        before = {name: getattr(embers, name).to_numpy() for name in ("number", "age", "life")}
+        made.advance_frame()
+        replaced = (embers.number.to_numpy() != before["number"]) & (before["number"] >= 0)
+        assert (before["age"] >= before["life"])[replaced].all()
+    assert replaced.any()
+
+
+def test_a_source_without_an_inside_is_refused_at_the_start():
+    with pytest.raises(ValueError, match="hardly any inside"):
+        world(source={"shape": {"type": "torus", "major_radius": 0.2, "minor_radius": 0.0004}})
+
+
 def test_bodies_and_the_floor_stop_them():
     plate = {
         "name": "plate",
