@@ -18,7 +18,7 @@ from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 
 CPU_LANES = 256
-GPU_LANES = 32768  # few for a CPU, whose threads read best what lies together; enough for a GPU to be busy
+GPU_LANES = 131072  # few for a CPU, whose threads read best what lies together; enough for a GPU to be busy
 BRANCHES, LAST_BRANCHES = 128, 16  # numbers that one node of the tree takes together: of lanes, and at last
 MAX_QUANTITIES = 8  # most maxima and sums of one reduction, which its kernel returns as a vector
 

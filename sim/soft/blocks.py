@@ -6,11 +6,13 @@ no node of any particle are neither stored nor computed; of the others there is 
 domain. Blocks are numbered, and particles of a cell sorted, in an order that no thread decides.
 """
 
+import itertools
 import math
 from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import bundle, func
@@ -24,7 +26,10 @@ NODES = EDGE**3
 SUPPORT = 3  # nodes along an axis that a particle has a share in
 RING = 3  # nodes around the domain: what particles at its faces reach, and one
 GROWTH = 1.1
+MARGIN = 0.5  # how far particles may go before blocks are found anew [edges]
 MOST_BLOCKS = 2**28
+
+AROUND = tuple(itertools.product((-1.0, 1.0), repeat=3))
 
 Triple = ti.types.vector(3, ti.i32)
 
@@ -66,7 +71,7 @@ class BlockGrid:
                 f"{EDGE * edge:g} m, more than {MOST_BLOCKS}; give a smaller domain or a larger cell_size"
             )
         total = math.prod(shape.astype(int).tolist())
-        self._n, self.count = particles, 0
+        self._n, self.count, self._way = particles, 0, math.inf
         self._lattice = {
             "origin": tuple((low - RING * edge).tolist()),
             "edge": edge,
@@ -79,17 +84,27 @@ class BlockGrid:
         self._make_room(64)
 
     def sort(self, position: ti.Ndarray, body: ti.Ndarray) -> bool:
-        """Find the blocks of the particles and sort them; returns whether there is room for more blocks than before.
+        """Sort the particles by cell; returns whether there is room for more blocks than before.
 
         Particles of body -1 are left out.
         """
-        grown = False
+        grown = not self._way <= MARGIN and self._find(position, body)
+        sort_by_cell(self.blocks, self.count, position, body, self._n)
+        return grown
+
+    def moved(self, way: float) -> None:
+        """Take note that particles went so far at most [m]; infinite where they are others now."""
+        self._way += way / self._lattice["edge"]
+
+    def _find(self, position: ti.Ndarray, body: ti.Ndarray) -> bool:
+        """Find the blocks that hold nodes of particles until these have gone as far as the margin."""
+        grown, self._way = False, 0.0
         self.count = find_blocks(self.blocks, position, body, self._n)
         while self.count > self.blocks.room:
             self._make_room(int(GROWTH * self.count))
             grown = True
             self.count = find_blocks(self.blocks, position, body, self._n)
-        sort_by_cell(self.blocks, self.count, self._n)
+        find_neighbors(self.blocks, self.count)
         return grown
 
     def _make_room(self, room: int) -> None:
@@ -108,6 +123,13 @@ class BlockGrid:
             ),
             room=room,
         )
+
+
+def sorted_by_cell(points: NDArray[np.float32], domain: DomainParameters, edge: float) -> NDArray[np.float32]:
+    """Points (n, 3) [m] block by block and cell by cell: rows of neighbours lie together, for as long as they stay."""
+    base = np.floor((points - np.array(domain.min)) / edge + RING - 0.5).astype(int)
+    keys = (*base.T, *(base // EDGE).T)
+    return points[np.lexsort(keys)]
 
 
 @func
@@ -180,7 +202,9 @@ def find_blocks(blocks: Blocks, position: Vectors, body: Integers, count: ti.i32
         blocks.mark[m] = 0
     for p in range(count):
         if body[p] >= 0:
-            blocks.mark[block_of(base_of(position[p], blocks), blocks)] = 1
+            for dx, dy, dz in ti.static(AROUND):
+                reached = position[p] + blocks.edge * MARGIN * ti.math.vec3(dx, dy, dz)
+                blocks.mark[block_of(base_of(reached, blocks), blocks)] = 1
     for m in range(total):
         x, y, z = m % blocks.shape[0], m // blocks.shape[0] % blocks.shape[1], m // (blocks.shape[0] * blocks.shape[1])
         reached = 0
@@ -197,18 +221,12 @@ def find_blocks(blocks: Blocks, position: Vectors, body: Integers, count: ti.i32
             blocks.number[m] = -1
         elif blocks.number[m] < blocks.room:
             blocks.place[blocks.number[m]] = m
-    for p in range(count):
-        cell = found * NODES
-        if body[p] >= 0:
-            cell = node_at(base_of(position[p], blocks), blocks)
-        blocks.sort.cell_of[p] = cell
     return found
 
 
 @kernel
-def sort_by_cell(blocks: Blocks, stored: ti.i32, count: ti.i32):
-    """Neighbours of blocks, and a counting sort, particles of a cell by number."""
-    cells = stored * NODES
+def find_neighbors(blocks: Blocks, stored: ti.i32):
+    """The blocks beside each stored one."""
     for k in range(8 * stored):
         place = blocks.place[k // 8]
         step = ((k // 4 % 2) * blocks.shape[1] + k // 2 % 2) * blocks.shape[0] + k % 2
@@ -217,8 +235,18 @@ def sort_by_cell(blocks: Blocks, stored: ti.i32, count: ti.i32):
         if place >= step:
             behind = blocks.number[place - step]
         blocks.behind[k] = behind
+
+
+@kernel
+def sort_by_cell(blocks: Blocks, stored: ti.i32, position: Vectors, body: Integers, count: ti.i32):
+    """Sort particles by counting, those of a cell by number; those that have left come last."""
+    cells = stored * NODES
     for c in range(cells + 1):
         blocks.sort.cursor[c] = 0
     for p in range(count):
-        ti.atomic_add(blocks.sort.cursor[blocks.sort.cell_of[p]], 1)
+        cell = cells
+        if body[p] >= 0:
+            cell = node_at(base_of(position[p], blocks), blocks)
+        blocks.sort.cell_of[p] = cell
+        ti.atomic_add(blocks.sort.cursor[cell], 1)
     settle_in_cells(count, cells, blocks.sort.cell_of, False, blocks.sort)

@@ -71,15 +71,17 @@ class Pouring:
         """Of those that are still to come [m/s]."""
         return float(self._fastest_left[self.here])
 
-    def let_in(self, particles: Particles, time_s: float) -> None:
-        """Place those whose time has come by a time [s], as far on their way as they are by then."""
+    def let_in(self, particles: Particles, time_s: float) -> bool:
+        """Place those whose time has come by a time [s], as far on their way as they are then; whether any are."""
+        before = self.here
         due = int(np.searchsorted(self._poured.time_s, time_s, side="right"))
         for end in self._ends[np.searchsorted(self._ends, self.here, side="right") :]:
             if end > due:
-                return
+                break
             age = time_s - float(self._poured.time_s[self.here])
             place_layer(particles, self._place, self._velocity, self._first, self.here, int(end), age)
             self.here = int(end)
+        return self.here > before
 
 
 @kernel

@@ -21,7 +21,7 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.forces.field import ForceField
 from sim.shapes.filled_volume import Surroundings, pack
 from sim.shapes.placement import build_solid
-from sim.soft.blocks import NODES, BlockGrid
+from sim.soft.blocks import NODES, BlockGrid, sorted_by_cell
 from sim.soft.contact import BodyContacts, stop_at_walls
 from sim.soft.laws import Laws
 from sim.soft.materials import Law
@@ -30,11 +30,12 @@ from sim.soft.pouring import Poured, Pouring, has_come, waiting_rows
 from sim.soft.transfers import (
     COUNTS,
     MAXIMA,
+    PARTS,
     SHARES,
+    SYMMETRIC,
     Load,
     Nodes,
     Particles,
-    Shares,
     grid_to_particles,
     measure,
     particles_to_grid,
@@ -52,6 +53,8 @@ STATE = ("position", "velocity", "affine", "strain", "stress", "history", "body"
 """Arrays that a checkpoint has."""
 
 TINY_SPEED = 1.0e-12  # of what does not move at all [m/s]
+
+MOST_SHARES = 2**31 - 1  # numbers that an array of a kernel can have
 
 RUNAWAY_SPEED = 1.0e4  # no soft matter of a film moves at thirty times the speed of sound [m/s]
 
@@ -104,10 +107,8 @@ class SoftSolver:
         density = np.array([each.value("density") for each in self.parameters])
         particle_mass = density * volume
         self.mass = float(particle_mass[self.owner].sum())
-        matrices = [ti.Matrix.ndarray(3, 3, ti.f32, n) for _ in range(3)]
-        self.particles = Particles(
-            on_device(position), on_device(velocity), *matrices, ti.ndarray(ti.f32, n), on_device(body), n
-        )
+        rows_of = [ti.ndarray(ti.f32, components * n) for components in (9, len(SYMMETRIC), len(SYMMETRIC), 1)]
+        self.particles = Particles(on_device(position), on_device(velocity), *rows_of, on_device(body), n)
         self.spacing = self.parameters[0].spacing
         self.masses, self.volume = on_device(particle_mass), volume
         self._load_particles(0)
@@ -131,10 +132,13 @@ class SoftSolver:
 
     def _make_nodes(self) -> None:
         room = self._grid.blocks.room * NODES
-        self._nodes, self._shares = (
-            kind(ti.ndarray(ti.f32, length), ti.Vector.ndarray(3, ti.f32, length))
-            for kind, length in ((Nodes, room), (Shares, SHARES * room))
-        )
+        if PARTS * SHARES * room > MOST_SHARES:
+            raise ValueError(
+                f"soft matter fills {room:.3g} cells, more than {MOST_SHARES // (PARTS * SHARES):.3g}; use a larger "
+                "cell_size"
+            )
+        self._nodes = Nodes(ti.ndarray(ti.f32, room), ti.Vector.ndarray(3, ti.f32, room))
+        self._shares = ti.ndarray(ti.f32, PARTS * SHARES * room)
 
     def _measure(self) -> None:
         """Note how fast particles are, how hard, and whether all are finite."""
@@ -158,8 +162,8 @@ class SoftSolver:
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         particles, grid = self.particles, self._grid
-        if self._pouring is not None:
-            self._pouring.let_in(particles, self._time_s)
+        if self._pouring is not None and self._pouring.let_in(particles, self._time_s):
+            grid.moved(math.inf)
         self._time_s += dt
         if self._forces.accelerates:
             push_particles(particles, self._forces.now, dt)
@@ -173,6 +177,7 @@ class SoftSolver:
         stop_at_walls(blocks, stored, self._nodes, self._box, self.parameters[0].friction)
         grid_to_particles(blocks, stored, particles, self._laws, self._nodes, self._box, dt)
         self._measure()
+        grid.moved(dt * self._speed)
 
     def begin_frame(self, time_s: float) -> None:
         """Emitters go by the time of the frame."""
@@ -226,6 +231,7 @@ class SoftSolver:
             if arrays[name].shape != expected:
                 raise ValueError(f"{name} of the checkpoint has shape {arrays[name].shape}, not {expected}")
             array.from_numpy(np.ascontiguousarray(arrays[name]))
+        self._grid.moved(math.inf)
         if self._pouring is not None:
             self._pouring.here = int(has_come(arrays["body"])[-self._pouring.count :].sum())
         self._measure()
@@ -289,7 +295,7 @@ def _filled(
                     f'soft "{soft.name}" block[{number}] has no particle: it is outside the domain, inside solids, or '
                     "filled by the blocks before it"
                 )
-            positions.append(points)
+            positions.append(sorted_by_cell(points, domain, parameters[0].cell_size))
             velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
             bodies.append(np.full(len(points), index, dtype=np.int32))
     return np.concatenate(positions), np.concatenate(velocities), np.concatenate(bodies), spacing**3

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import taichi as ti
 
-from sim.core.arrays import Floats, Integers, Matrices, Vectors
+from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.box import Box
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
-from sim.core.reductions import Results, Share, is_finite, reduced_tree, runs_on_gpu
+from sim.core.reductions import Results, Share, is_finite, reduced_tree
 from sim.forces.field import ForceTable, change_of_velocity
 from sim.soft.blocks import (
     EDGE,
@@ -34,7 +34,8 @@ from sim.soft.laws import Laws, hardened, moved_strain, respond
 from sim.soft.materials import Law
 
 SHARES = SUPPORT**3
-WARP = 32  # threads of a GPU that read together
+PARTS = 4  # of a share: mass, and momentum along x, y, z
+SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # what is kept of a symmetric matrix
 APIC = 4.0  # over h², the inverse of the splines' second moment
 MAXIMA, COUNTS = 2, 1  # of `measure`
 AWAY = 1.0e9  # coordinate of what has left, where it is in no one's way [m]
@@ -42,13 +43,16 @@ AWAY = 1.0e9  # coordinate of what has left, where it is in no one's way [m]
 
 @bundle
 class Particles(NamedTuple):
-    """Particles, (n,) each; body -1 has left, and those below wait; they are far away then."""
+    """Particles, (n,) each; body -1 has left, and those below wait; they are far away then.
+
+    Of matrices each component has a row of its own, so that threads read what lies together.
+    """
 
     position: Vectors  # [m]
     velocity: Vectors  # [m/s]
-    affine: Matrices  # C [1/s]; within a step its momentum across a cell [kg m/s]
-    strain: Matrices  # elastic b - 1 [-]
-    stress: Matrices  # Kirchhoff [Pa]
+    affine: Floats  # C [1/s], (9 n,)
+    strain: Floats  # elastic b - 1 [-], (6 n,)
+    stress: Floats  # Kirchhoff [Pa], (6 n,)
     history: Floats  # of the law [-]
     body: Integers
     count: ti.i32
@@ -61,14 +65,6 @@ class Load(NamedTuple):
     mass: Floats  # [kg]
     momentum: Vectors  # with the impulses on the particle, before gravity [kg m/s]
     there: ti.template()  # whether anything can touch them; no particle has a load otherwise
-
-
-@bundle
-class Shares(NamedTuple):
-    """What the particles of each cell give each of their 27 nodes, (k * 64 * 27,); of no meaning in empty cells."""
-
-    mass: Floats  # [kg]
-    momentum: Vectors  # [kg m/s]
 
 
 @bundle
@@ -89,48 +85,37 @@ def push_particles(particles: Particles, forces: ForceTable, dt: ti.f32):
             particles.velocity[p] = v_p + change
 
 
-@ti.func
-def spline(distance: ti.f32) -> ti.f32:
-    """The quadratic B-spline at a distance [lattice edges]."""
-    d = ti.abs(distance)
-    return ti.select(d < 0.5, 0.75 - d * d, 0.5 * ti.max(1.5 - d, 0.0) ** 2)
-
-
-@ti.func
-def weight_at(away: ti.math.vec3) -> ti.f32:
-    """Share of a particle in a node [-]."""
-    return spline(away[0]) * spline(away[1]) * spline(away[2])
+@func
+def symmetric_at(rows: Floats, p: ti.i32, count: ti.i32) -> ti.math.mat3:
+    """A particle's symmetric matrix."""
+    matrix = ti.math.mat3(0.0)
+    for k in ti.static(range(6)):
+        i, j = ti.static(SYMMETRIC[k])
+        value = rows[k * count + p]
+        matrix[i, j] = value
+        matrix[j, i] = value
+    return matrix
 
 
 @func
-def give(
-    cell: ti.i32,
-    corner: Triple,
-    lane: ti.i32,
-    blocks: Blocks,
-    particles: Particles,
-    masses: Floats,
-    load: Load,
-    shares: Shares,
-):
-    """What the particles of a cell, with this lowest node, give to one of their nodes, their loads included."""
-    at = ti.cast(corner + Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2), ti.f32)
-    mass = 0.0
-    momentum = ti.math.vec3(0.0)
-    for s in range(blocks.sort.cell_start[cell], blocks.sort.cell_start[cell + 1]):
-        p = blocks.sort.order[s]
-        away = at - place_of(particles.position[p], blocks)
-        weight = weight_at(away)
-        own = masses[particles.body[p]]
-        carried = own * particles.velocity[p] + particles.affine[p] @ away
-        if ti.static(load.there):
-            own += load.mass[p]
-            carried += load.momentum[p]
-        mass += weight * own
-        momentum += weight * carried
-    place = cell * SHARES + lane
-    shares.mass[place] = mass
-    shares.momentum[place] = momentum
+def keep_symmetric(rows: Floats, p: ti.i32, count: ti.i32, matrix: ti.math.mat3):
+    """Put a particle's symmetric matrix into its rows."""
+    for k in ti.static(range(6)):
+        i, j = ti.static(SYMMETRIC[k])
+        rows[k * count + p] = matrix[i, j]
+
+
+@ti.func
+def spline(distance: ti.f32) -> ti.f32:
+    """The quadratic B-spline at a distance below 1.5 [edges]."""
+    d = ti.abs(distance)
+    return ti.select(d < 0.5, 0.75 - d * d, 0.5 * (1.5 - d) ** 2)
+
+
+@ti.func
+def splines(offset: ti.math.vec3):
+    """Shares of the lowest, middle and highest node along each axis, of a particle so far from the lowest [edges]."""
+    return 0.5 * (1.5 - offset) ** 2, 0.75 - (offset - 1.0) ** 2, 0.5 * (offset - 0.5) ** 2
 
 
 @kernel
@@ -141,36 +126,50 @@ def particles_to_grid(
     masses: Floats,
     volume: ti.f32,
     load: Load,
-    shares: Shares,
+    shares: Floats,
     nodes: Nodes,
     gravity: ti.math.vec3,
     dt: ti.f32,
 ):
-    """Mass and velocity of the nodes, gravity included; C becomes its momentum with the impulse of the stress.
+    """Mass and velocity of the nodes, gravity included.
 
     Particles have masses by body [kg], and all of them one volume at rest [m³]. What touches a particle has its C.
+    `shares` are what the particles of a cell give to its 27 nodes: of each node a row of masses [kg] and three of
+    momenta [kg m/s], with a number for every cell; those of empty cells mean nothing.
     """
-    for p in range(particles.count):
-        b = particles.body[p]
-        if b >= 0:
-            pull = dt * volume * APIC / blocks.edge
-            mass = masses[b]
-            if ti.static(load.there):
-                mass += load.mass[p]
-            particles.affine[p] = blocks.edge * mass * particles.affine[p] - pull * particles.stress[p]
-    if ti.static(runs_on_gpu()):
-        ti.loop_config(block_dim=128)
-        for i in range(stored * (NODES * WARP)):
-            cell = i // WARP
-            if i % WARP < SHARES and blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
-                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, masses, load, shares)
-    else:
-        for cell in range(stored * NODES):
-            if blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
-                corner = node_of(cell, blocks)
-                for lane in range(SHARES):
-                    give(cell, corner, lane, blocks, particles, masses, load, shares)
-    for n in range(stored * NODES):
+    cells = stored * NODES
+    pull = dt * volume * APIC / blocks.edge
+    for k in range(SUPPORT * cells):
+        cell, dz = k // SUPPORT, k % SUPPORT
+        first, end = blocks.sort.cell_start[cell], blocks.sort.cell_start[cell + 1]
+        if first < end:
+            lowest = ti.cast(node_of(cell, blocks) + Triple(0, 0, dz), ti.f32)
+            given = ti.Vector([0.0] * (PARTS * SUPPORT * SUPPORT))
+            for s in range(first, end):
+                p = blocks.sort.order[s]
+                away = place_of(particles.position[p], blocks) - lowest
+                weights, across = splines(away), spline(away[2])
+                mass = masses[particles.body[p]]
+                momentum = mass * particles.velocity[p]
+                if ti.static(load.there):
+                    mass += load.mass[p]
+                    momentum += load.momentum[p]
+                affine = -pull * symmetric_at(particles.stress, p, particles.count)
+                for i, j in ti.static(ti.ndrange(3, 3)):
+                    affine[i, j] += blocks.edge * mass * particles.affine[(3 * i + j) * particles.count + p]
+                momentum -= affine @ away
+                for dy, dx in ti.static(ti.ndrange(SUPPORT, SUPPORT)):
+                    weight = weights[dx][0] * weights[dy][1] * across
+                    carried = momentum + affine @ ti.math.vec3(dx, dy, 0.0)
+                    at = ti.static(PARTS * (dy * SUPPORT + dx))
+                    given[at] += weight * mass
+                    for axis in ti.static(range(3)):
+                        given[at + 1 + axis] += weight * carried[axis]
+            for node in ti.static(range(SUPPORT * SUPPORT)):
+                row = PARTS * (SUPPORT * SUPPORT * dz + node)
+                for part in ti.static(range(PARTS)):
+                    shares[(row + part) * cells + cell] = given[PARTS * node + part]
+    for n in range(cells):
         inside = Triple(n % EDGE, n // EDGE % EDGE, n % NODES // (EDGE * EDGE))
         mass = 0.0
         momentum = ti.math.vec3(0.0)
@@ -178,8 +177,9 @@ def particles_to_grid(
             base = inside - Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2)
             cell = cell_behind(n // NODES, base, blocks)
             if cell >= 0 and blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
-                mass += shares.mass[cell * SHARES + lane]
-                momentum += shares.momentum[cell * SHARES + lane]
+                at = PARTS * lane * cells + cell
+                mass += shares[at]
+                momentum += ti.math.vec3(shares[at + cells], shares[at + 2 * cells], shares[at + 3 * cells])
         nodes.mass[n] = mass
         nodes.velocity[n] = ti.select(mass > 0.0, momentum / ti.max(mass, 1.0e-30) + dt * gravity, ti.math.vec3(0.0))
 
@@ -195,32 +195,34 @@ def grid_to_particles(
     dt: ti.f32,
 ):
     """Velocities from nodes; places, strains and stresses after the step. What passed an open face leaves."""
-    h = blocks.edge
     for s in range(blocks.sort.cell_start[stored * NODES]):
         p = blocks.sort.order[s]
         x = particles.position[p]
-        place = place_of(x, blocks)
         base = base_of(x, blocks)
+        offset = place_of(x, blocks) - ti.cast(base, ti.f32)
+        weights = splines(offset)
         velocity = ti.math.vec3(0.0)
         affine = ti.math.mat3(0.0)
         block, inside = blocks.number[block_of(base, blocks)], base & (EDGE - 1)
-        for dz in ti.static(range(SUPPORT)):
-            for dy in ti.static(range(SUPPORT)):
-                for dx in ti.static(range(SUPPORT)):
-                    step = Triple(dx, dy, dz)
-                    away = ti.cast(base + step, ti.f32) - place
-                    v_i = weight_at(away) * nodes.velocity[node_ahead(block, inside + step, blocks)]
-                    velocity += v_i
-                    affine += v_i.outer_product(away)
-        affine *= APIC / h
+        for dz in range(SUPPORT):
+            across = spline(offset[2] - ti.cast(dz, ti.f32))
+            for dy, dx in ti.static(ti.ndrange(SUPPORT, SUPPORT)):
+                step = Triple(dx, dy, dz)
+                weight = weights[dx][0] * weights[dy][1] * across
+                v_i = weight * nodes.velocity[node_ahead(block, inside + step, blocks)]
+                velocity += v_i
+                affine += v_i.outer_product(ti.cast(step, ti.f32) - offset)
+        affine *= APIC / blocks.edge
         change = dt * affine
         change += 0.5 * change @ change
         b = particles.body[p]
-        strain, stress, history = respond(moved_strain(particles.strain[p], change), b, particles.history[p], dt, laws)
+        trial = moved_strain(symmetric_at(particles.strain, p, particles.count), change)
+        strain, stress, history = respond(trial, b, particles.history[p], dt, laws)
         particles.velocity[p] = velocity
-        particles.affine[p] = affine
-        particles.strain[p] = strain
-        particles.stress[p] = stress
+        for i, j in ti.static(ti.ndrange(3, 3)):
+            particles.affine[(3 * i + j) * particles.count + p] = affine[i, j]
+        keep_symmetric(particles.strain, p, particles.count, strain)
+        keep_symmetric(particles.stress, p, particles.count, stress)
         particles.history[p] = history
         moved = ti.min(ti.max(x + dt * velocity, box.wall_low), box.wall_high)
         particles.position[p] = moved

@@ -28,11 +28,12 @@ def linear_and_angular(world: Any) -> tuple[np.ndarray, np.ndarray]:
     soft, rigid = world.solvers["soft"], world.solvers["rigid"]
     x, v = (np.asarray(each, np.float64) for each in soft.view("jelly").values())
     mass = soft.mass / len(x)
-    carried = 0.25 * soft.parameters[0].cell_size ** 2 * soft.particles.affine.to_numpy().astype(np.float64)
-    lower, upper = carried[:, [2, 0, 1], [1, 2, 0]], carried[:, [1, 2, 0], [2, 0, 1]]
+    affine = soft.particles.affine.to_numpy().astype(np.float64).reshape(3, 3, -1)
+    carried = 0.25 * soft.parameters[0].cell_size ** 2 * affine
+    lower, upper = carried[[2, 0, 1], [1, 2, 0]], carried[[1, 2, 0], [2, 0, 1]]
     bodies = rigid.bodies
     linear = mass * v.sum(axis=0) + (bodies.mass[:, None] * bodies.velocity).sum(axis=0)
-    angular = mass * (np.cross(x, v) + lower - upper).sum(axis=0) + bodies.angular_momentum().sum(axis=0)
+    angular = mass * (np.cross(x, v) + (lower - upper).T).sum(axis=0) + bodies.angular_momentum().sum(axis=0)
     angular += (bodies.mass[:, None] * np.cross(bodies.position, bodies.velocity)).sum(axis=0)
     return linear, angular
 

@@ -7,6 +7,7 @@ import pytest
 from thread_counts import digest_of, result_on_threads
 
 from sim.core.domain import DomainParameters
+from sim.soft import blocks
 from sim.soft.parameters import SoftParameters
 from sim.soft.solver import SoftSolver
 
@@ -38,9 +39,9 @@ def angular_momentum(solver):
     """Of positions and of the affine part that each particle carries, about the origin [kg m²/s]."""
     particles, h = solver.particles, solver.parameters[0].cell_size
     x, v = particles.position.to_numpy().astype(np.float64), particles.velocity.to_numpy().astype(np.float64)
-    carried = 0.25 * h * h * particles.affine.to_numpy().astype(np.float64)
-    lower, upper = carried[:, [2, 0, 1], [1, 2, 0]], carried[:, [1, 2, 0], [2, 0, 1]]
-    return solver.mass / len(x) * (np.cross(x, v) + lower - upper).sum(axis=0)
+    carried = 0.25 * h * h * particles.affine.to_numpy().astype(np.float64).reshape(3, 3, -1)
+    lower, upper = carried[[2, 0, 1], [1, 2, 0]], carried[[1, 2, 0], [2, 0, 1]]
+    return solver.mass / len(x) * (np.cross(x, v) + (lower - upper).T).sum(axis=0)
 
 
 def momentum(solver):
@@ -172,3 +173,26 @@ def test_a_checkpoint_of_another_body_is_refused():
     other = SoftSolver([soft(size=(0.1, 0.1, 0.1))], domain=DOMAIN, gravity=FREE)
     with pytest.raises(ValueError, match="position of the checkpoint has shape"):
         solver.restore(other.checkpoint())
+
+
+def test_blocks_that_are_kept_while_particles_go_half_a_cell_give_the_bits_of_blocks_found_in_each_step(monkeypatch):
+    found = []
+    for margin in (blocks.MARGIN, 0.0):
+        monkeypatch.setattr(blocks, "MARGIN", margin)
+        solver = SoftSolver([soft(velocity=(1.0, 0.5, 0.0))], domain=DOMAIN, gravity=(0.0, 0.0, -GRAVITY))
+        searches = 0
+        find = solver._grid._find
+
+        def counted(*arrays, find=find):
+            nonlocal searches
+            searches += 1
+            return find(*arrays)
+
+        monkeypatch.setattr(solver._grid, "_find", counted)
+        for _ in range(40):
+            solver.substep(solver.stable_dt())
+        found.append((searches, solver.checkpoint()))
+    (few, kept), (many, anew) = found
+    assert 1 < few < 20 and many == 40
+    for name, array in kept.items():
+        np.testing.assert_array_equal(array, anew[name], err_msg=name)
