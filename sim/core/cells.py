@@ -173,17 +173,15 @@ def counting_sort(
     cell_count = grid.shape[0] * grid.shape[1] * grid.shape[2]
     for cell in range(cell_count + 1):
         arrays.cursor[cell] = 0
-    dropped = 0
     for i in range(count):
         x_i = positions[i]
         cell = row_of_cell(cell_of_point(x_i, grid), 0, 0, grid)
         if (x_i < keep_low).any() or (x_i > keep_high).any():
             cell = cell_count
-            dropped += 1
         arrays.cell_of[i] = cell
         ti.atomic_add(arrays.cursor[cell], 1)
     settle_in_cells(count, cell_count, ids, True, arrays)
-    return dropped
+    return count - arrays.cell_start[cell_count]
 
 
 @func

@@ -160,41 +160,57 @@ def cells_in_reach(
 
 
 @func
-def count_near(
-    point: Point, cell: Cells, points: SortedPoints, grid: Grid, radius_squared: ti.f32, on_gpu: ti.template()
-) -> ti.i32:
-    """Number of points within the radius; without a branch on the distance, so that it becomes vector code.
-
-    A CPU reads whole rows of cells: loops of uneven length cost it more.
-    """
+def count_near(point: Point, points: SortedPoints, first: ti.i32, last: ti.i32, radius_squared: ti.f32) -> ti.i32:
+    """Number of a range's points within the radius; no branch on the distance, so that it becomes vector code."""
     near = 0
-    for dz in range(-grid.reach, grid.reach + 1):
-        for dy in range(-grid.reach, grid.reach + 1):
-            row = row_of_cell(cell, dy, dz, grid)
-            touched = ti.math.ivec2(-grid.reach, grid.reach + 1)
-            if ti.static(on_gpu):
-                touched = cells_in_reach(point, cell, dy, dz, grid, radius_squared)
-            for j in range(points.cell_start[row + touched[0]], points.cell_start[row + touched[1]]):
-                d_x, d_y, d_z = point[0] - points.x[j], point[1] - points.y[j], point[2] - points.z[j]
-                near += ti.cast(d_x * d_x + d_y * d_y + d_z * d_z < radius_squared, ti.i32)
+    for j in range(first, last):
+        d_x, d_y, d_z = point[0] - points.x[j], point[1] - points.y[j], point[2] - points.z[j]
+        near += ti.cast(d_x * d_x + d_y * d_y + d_z * d_z < radius_squared, ti.i32)
     return near
 
 
 @func
-def count_neighbors(search: Search, lists: Neighbors):
-    """Upper bounds of the numbers of neighbours, the particle itself included, and of boundary samples."""
+def count_in_row(
+    point: Point, points: SortedPoints, row: ti.i32, touched: ti.math.ivec2, radius_squared: ti.f32
+) -> ti.i32:
+    """Number of points within the radius in the touched cells of a row."""
+    first, last = points.cell_start[row + touched[0]], points.cell_start[row + touched[1]]
+    return count_near(point, points, first, last, radius_squared)
+
+
+@func
+def count_neighbors(search: Search, lists: Neighbors, slices: Slices):
+    """Upper bounds of the numbers of neighbours, the particle itself included, and of boundary samples.
+
+    The room of a slice becomes the longest list in it. A CPU reads whole rows of cells: loops of uneven length cost it
+    more.
+    """
     # A little more than the radius of the list, where a distance may be rounded differently.
     radius_squared = search.radius * search.radius * (1.0 + ROUNDING_MARGIN)
-    on_gpu = ti.static(lists.stride > 1)
+    # Every particle has one place to write to before it knows whether to keep; one at NaN is not even near itself.
+    for s in range(slices.count):
+        slices.room[s] = 1
     ti.loop_config(block_dim=128)
     for i in range(search.count):
         x_i = Point(search.points.x[i], search.points.y[i], search.points.z[i])
         cell = cell_of_point(x_i, search.grid)
-        lists.fluid_count[i] = count_near(x_i, cell, search.points, search.grid, radius_squared, on_gpu)
-        boundary_near = count_near(x_i, cell, search.fixed, search.grid, radius_squared, on_gpu)
-        if ti.static(search.with_moving):
-            boundary_near += count_near(x_i, cell, search.moving, search.grid, radius_squared, on_gpu)
+        fluid_near, boundary_near = 0, 0
+        for dz in range(-search.grid.reach, search.grid.reach + 1):
+            for dy in range(-search.grid.reach, search.grid.reach + 1):
+                row = row_of_cell(cell, dy, dz, search.grid)
+                touched = ti.math.ivec2(-search.grid.reach, search.grid.reach + 1)
+                if ti.static(lists.stride > 1):
+                    touched = cells_in_reach(x_i, cell, dy, dz, search.grid, radius_squared)
+                fluid_near += count_in_row(x_i, search.points, row, touched, radius_squared)
+                boundary_near += count_in_row(x_i, search.fixed, row, touched, radius_squared)
+                if ti.static(search.with_moving):
+                    boundary_near += count_in_row(x_i, search.moving, row, touched, radius_squared)
+        lists.fluid_count[i] = fluid_near
         lists.boundary_count[i] = boundary_near
+        if ti.static(lists.stride > 1):
+            ti.atomic_max(slices.room[i // lists.stride], fluid_near + boundary_near)
+        else:
+            slices.room[i] = ti.max(fluid_near + boundary_near, 1)
 
 
 @kernel
@@ -203,15 +219,11 @@ def measure_lists(search: Search, lists: Neighbors, slices: Slices) -> Lengths:
 
     Returns the places of all slices, as int32, and roughly the thousands of them, which do not overflow.
     """
-    count_neighbors(search, lists)
+    count_neighbors(search, lists, slices)
     total = 0.0
     for s in range(slices.count):
-        # Every particle has one place to write to before it knows whether to keep; one at NaN is not even near itself.
-        longest = 1
-        for i in range(s * lists.stride, ti.min((s + 1) * lists.stride, search.count)):
-            longest = ti.max(longest, lists.fluid_count[i] + lists.boundary_count[i])
-        slices.room[s] = longest * lists.stride
-        total += ti.cast(longest * lists.stride, ti.f32)
+        slices.room[s] *= lists.stride
+        total += ti.cast(slices.room[s], ti.f32)
     length = scan_in_parallel(slices.room, slices.count, slices.scratch, slices.start)
     return Lengths(length, ti.cast(total / 1000.0, ti.i32))
 
