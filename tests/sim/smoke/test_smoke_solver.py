@@ -260,7 +260,7 @@ def test_grid_is_the_domain_unless_the_smoke_names_its_own_box():
 
 def test_a_plain_box_takes_less_than_120_bytes_a_cell(monkeypatch):
     made = Bytes(monkeypatch)
-    solver = SmokeSolver(plume(cell_size=1 / 48), domain=DOMAIN, gravity=GRAVITY)  # a GPU sums over 32,768 lanes
+    solver = SmokeSolver(plume(cell_size=1 / 64), domain=DOMAIN, gravity=GRAVITY)  # a GPU sums over 131,072 lanes
     cells = math.prod(solver.grid.cells)
     assert made.total < 120 * cells
 
