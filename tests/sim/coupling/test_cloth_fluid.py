@@ -58,12 +58,12 @@ def test_water_rests_on_a_sheet_as_on_a_floor(taichi_cpu, solver):
 
 
 @pytest.mark.parametrize("solver", sorted(SOLVERS))
-def test_water_that_fills_a_room_under_a_held_sheet_is_stirred_little(taichi_cpu, solver):
+def test_water_that_fills_a_room_under_a_held_sheet_is_still(taichi_cpu, solver):
     tank = sheet_in_a_shaft(solver, 0.0, 0.1, pin=EVERYWHERE)
     tank.run(0.2)
     _, velocity, _ = tank.particles()
-    # What it has too much in edges and corners it cannot get rid of: 0.37 m/s, and of PCISPH 1.6, by what tried to.
-    assert np.sqrt((velocity**2).sum(axis=1).mean()) < 0.3
+    # Denser in edges and corners than at rest it cannot settle: 0.37 m/s, and of PCISPH 1.6, without a sheet as well.
+    assert np.sqrt((velocity**2).sum(axis=1).mean()) < 0.05
 
 
 @pytest.mark.slow
