@@ -15,19 +15,29 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, layer_field, particle_volume, wall_calibration, wall_layers
+from sim.fluid.kernels import (
+    SUPPORT_IN_SPACINGS,
+    evaluate,
+    lattice_offsets,
+    layer_field,
+    particle_volume,
+    wall_calibration,
+    wall_layers,
+)
 from sim.shapes.solid import SignedDistance, outward_normals
 
 if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
+BEYOND_EDGE = 0.4  # weight of the row of a wall beyond an edge: with it walls bear nothing of the weight of a column
 DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
 
 
@@ -108,16 +118,20 @@ def domain_wall_samples(
 
     They are the products of three lines, one along each axis: points like a lattice of fluid within the domain, and at
     either end one for each layer of the wall, which weighs as much as a sample of the layer. As the kernel is nearly
-    such a product too, fluid has the density in edges and corners that it has inside, to 0.5 % at the usual support
+    such a product too, fluid has the density in edges and corners that it has inside, to 0.3 % at the usual support
     and 1.5 % at wider ones. A wall reaches one layer beyond an open face, or half of a wide support, so that fluid that
     runs along it is held until it has left.
+
+    At the usual support no fluid at rest feels where two walls meet, so walls end beyond each other instead, a row
+    outside of the domain (`_wall_line`).
     """
+    is_usual = support_in_spacings == SUPPORT_IN_SPACINGS
     lines = (_wall_line(domain, axis, spacing, support_in_spacings) for axis in range(3))
     insides, walls = zip(*lines, strict=True)
     points, weights = [np.empty((0, 3))], [np.empty(0)]
     # Walls across x with all of y and z; then those across y, and across z, that are not among them.
     for across in range(3):
-        chosen = [insides[a] if a < across else np.concatenate([insides[a], walls[a]]) for a in range(3)]
+        chosen = [insides[a] if a < across or is_usual else np.concatenate([insides[a], walls[a]]) for a in range(3)]
         chosen[across] = walls[across]
         points.append(np.stack(np.meshgrid(*(c[:, 0] for c in chosen), indexing="ij"), axis=-1).reshape(-1, 3))
         products = np.meshgrid(*(c[:, 1] for c in chosen), indexing="ij")
@@ -188,20 +202,44 @@ def _wall_line(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coordinates along an axis [m] with their weights in particles [-]: of fluid, and of the walls across it, (n, 2).
 
-    Beyond an open face the fluid's points go on for half of the support.
+    Beyond an open face the fluid's points go on for half of the support. At the usual support they go on for one beyond
+    a closed face as well, and the last one before it weighs less (`edge_row`): a wall that ended at the other one would
+    push what lies there along itself, into the other.
     """
     low, high = domain.min[axis], domain.max[axis]
     count = max(round((high - low) / spacing), 1)
     stretched = (high - low) / count
-    beyond = [
-        math.ceil(0.5 * support_in_spacings) if f"{'xyz'[axis]}{side}" in domain.open_faces else 0 for side in "-+"
-    ]
+    is_open = [f"{'xyz'[axis]}{side}" in domain.open_faces for side in "-+"]
+    is_usual = support_in_spacings == SUPPORT_IN_SPACINGS
+    beyond = [math.ceil(0.5 * support_in_spacings) if each or is_usual else 0 for each in is_open]
     inside = low + stretched * (np.arange(-beyond[0], count + beyond[1]) + 0.5)
+    weights = np.full(len(inside), stretched / spacing)
+    for row, closed in ((0, not is_open[0]), (-1, not is_open[1])):
+        if is_usual and closed:
+            weights[row] *= BEYOND_EDGE
+            weights[row + 1 if row == 0 else row - 1] *= edge_row()
     walls = [
         (end + sign * (layer.standoff_in_spacings - 0.5) * spacing, layer.volume_in_particles)
-        for end, sign, open_layers in ((low, -1.0, beyond[0]), (high, 1.0, beyond[1]))
-        if not open_layers
+        for end, sign, opened in ((low, -1.0, is_open[0]), (high, 1.0, is_open[1]))
+        if not opened
         for layer in wall_layers(support_in_spacings)
     ]
-    weights = np.full(len(inside), stretched / spacing)
     return np.stack([inside, weights], axis=1), np.array(walls).reshape(-1, 2)
+
+
+@cache
+def edge_row() -> float:
+    """Weight of a wall's row of samples next to an edge with which a lattice is as dense there as in a face [-].
+
+    The rows beside it, one of which lies beyond the edge, weigh 1 each, so that nothing is pushed along the wall.
+    """
+    (layer,) = wall_layers()
+    offsets = lattice_offsets()
+    # An edge lacks a quarter of the fluid that a face has, and has another wall; both walls lack a part of two rows.
+    beyond = offsets[(offsets[:, 0] >= 0.0) & (offsets[:, 1] < 0.0)]
+    lacking = float(evaluate(np.linalg.norm(beyond, axis=1), SUPPORT_IN_SPACINGS).sum())
+    in_wall = offsets[offsets[:, 0] == 0.0]
+    distances = np.hypot(np.linalg.norm(in_wall, axis=1), layer.standoff_in_spacings)
+    wall = layer.volume_in_particles * evaluate(distances, SUPPORT_IN_SPACINGS)
+    own, outer = (float(wall[in_wall[:, 1] == row].sum()) for row in (0.0, -1.0))
+    return float(1.0 - (wall.sum() - lacking - 2.0 * (1.0 - BEYOND_EDGE) * outer) / (2.0 * own))
