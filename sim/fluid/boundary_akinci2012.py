@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
-BEYOND_EDGE = 0.4  # weight of the row of a wall beyond an edge: with it walls bear nothing of the weight of a column
+BEYOND_EDGE = 0.5  # weight of the row of a wall beyond an edge: with it walls bear nothing of the weight of a column
 DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
 
 
@@ -231,7 +231,7 @@ def _wall_line(
 def edge_row() -> float:
     """Weight of a wall's row of samples next to an edge with which a lattice is as dense there as in a face [-].
 
-    The rows beside it, one of which lies beyond the edge, weigh 1 each, so that nothing is pushed along the wall.
+    The row beyond the edge weighs `BEYOND_EDGE`, and the one on its other side 1.
     """
     (layer,) = wall_layers()
     offsets = lattice_offsets()
