@@ -16,6 +16,9 @@ from sim.shapes.parameters import Placement
 
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
 
+SLIPPERY_ANGLE_DEG = 45.0  # contact angle below which a drop that spreads on a smooth wall tears [degrees]
+SPREADING_FRICTION = 5.0  # of walls, with which it does not [-]
+
 _DYE = "Concentration of dye, from 0 to 1 [-], which has the colour dye_color of the fluid's material,"
 
 
@@ -102,10 +105,11 @@ class FluidParameters(Parameters):
         description="Strength; 0 switches it off. becker_teschner2007: cohesion kappa [m³/s²]; "
         "csf: surface tension sigma [N/m], 0.072 for water.",
     )
-    contact_angle_deg: Annotated[float, Field(ge=45.0, le=120.0)] = Field(
+    contact_angle_deg: Annotated[float, Field(ge=30.0, le=120.0)] = Field(
         default=90.0,
         description="Angle in the fluid between its surface and walls or bodies that it meets [degrees]: of water 50 "
-        "on glass that is not new, 70 to 80 on acrylic, 105 on wax. csf only.",
+        f"on glass that is not new, 70 to 80 on acrylic, 105 on wax. Below {SLIPPERY_ANGLE_DEG:g} it needs a "
+        f"wall_friction of {SPREADING_FRICTION:g} or more. csf only.",
     )
     air_density: NonNegative = Field(
         default=0.0,
@@ -204,6 +208,12 @@ class FluidParameters(Parameters):
             raise ValueError("wind moves nothing without air; set air_density, 1.2 kg/m³ for air, or remove wind")
         if "contact_angle_deg" in self.model_fields_set and self.surface_tension_model != "csf":
             raise ValueError('contact_angle_deg needs surface_tension_model = "csf"; remove it or name that model')
+        if self.contact_angle_deg < SLIPPERY_ANGLE_DEG and self.wall_friction < SPREADING_FRICTION:
+            raise ValueError(
+                f"contact_angle_deg = {self.contact_angle_deg:g} is below {SLIPPERY_ANGLE_DEG:g} and needs "
+                f"wall_friction = {SPREADING_FRICTION:g} or more, not {self.wall_friction:g}: a drop that spreads on a "
+                "smooth wall overshoots, and its rim tears"
+            )
         if self.surface_tension_model == "csf" and self.support_in_spacings != 2.0:
             raise ValueError(
                 f'surface_tension_model = "csf" needs support_in_spacings = 2, at which it is calibrated, not '
