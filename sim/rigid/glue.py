@@ -8,7 +8,7 @@ In every step the layers carry the difference between what acts on each piece, a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ from sim.rigid.supports import Supports, friction_pyramid, least_shares
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.cutting import cut_of
 from sim.shapes.parameters import PieceShape
+from sim.shapes.placement import PlacedSolid, build_rest_shape
 
 POISSON_RATIO = 0.2
 """Of brittle solids [-], about; Young's modulus does not change how loads are shared."""
@@ -51,6 +52,18 @@ class Faces:
     corner_face: Indices  # of all corners of the triangles: number of the face, (c,)
     corner: Array  # [m], (c, 3)
     share: Array  # of the area of its face that a corner stands for [m²], (c,)
+
+
+class Whole(NamedTuple):
+    """A body that was cut into pieces."""
+
+    shape: PieceShape  # of one of them
+    scale: float  # [-]
+    pieces: Indices  # numbers of their bodies, (p,)
+
+    def solid(self) -> PlacedSolid:
+        """What it is in one piece, in the axes of its pieces, about its own origin."""
+        return PlacedSolid(build_rest_shape(self.shape.of), self.scale, np.eye(3), np.zeros(3))
 
 
 class _Component(NamedTuple):
@@ -81,6 +94,8 @@ class Glue:
         leader: number of the body that stands for all that a body is glued to, its own if for none, (n,).
         arm: from its leader's centre of mass to that of each body, in its own axes [m], (n, 3).
         movers: bodies that move on their own, at the numbers of their leaders; others mean nothing.
+        wholes: what the pieces are of.
+        centre: centre of mass of each body, in the axes and about the origin of its whole [m], (n, 3).
         faces: all faces between pieces, (f,).
         is_broken: of these, (f,) bool.
     """
@@ -90,10 +105,11 @@ class Glue:
     ) -> None:
         """Take all moving bodies, with pieces where their wholes place them; sets the velocities of the pieces."""
         self._bodies, n = bodies, len(bodies)
-        self._centre = np.array([geometry.centre_of_mass for geometry in geometries])
+        self.centre = np.array([geometry.centre_of_mass for geometry in geometries])
         self._is_piece = np.array([body.whole is not None for body in parameters])
         self._impact_s = np.array([1.0 if body.breaks is None else body.breaks.impact_s for body in parameters])
-        self.faces = _faces_of(parameters)
+        self.wholes = tuple(_wholes_of(parameters))
+        self.faces = _faces_of(parameters, self.wholes)
         self.is_broken: NDArray[np.bool_] = np.zeros(len(self.faces.first), dtype=bool)
         self.leader, self.arm = np.arange(n), np.zeros((n, 3))
         self._known: dict[int, _Component] = {}
@@ -145,8 +161,8 @@ class Glue:
         for leader in np.unique(self.leader[pieces]):
             mine = pieces[self.leader[pieces] == leader]
             total = mass[mine].sum()
-            centre = mass[mine] @ self._centre[mine] / total
-            self.arm[mine] = self._centre[mine] - centre
+            centre = mass[mine] @ self.centre[mine] / total
+            self.arm[mine] = self.centre[mine] - centre
             arms = self.arm[mine]
             squares = np.einsum("ni,ni->n", arms, arms)[:, None, None] * np.eye(3)
             spread = mass[mine, None, None] * (squares - arms[:, :, None] * arms[:, None, :])
@@ -376,7 +392,7 @@ class Glue:
         of_face = faces.corner_face[corners]
         place, normal = faces.corner[corners], faces.normal[of_face]
         size = float(np.ptp(place, axis=0).max())
-        apart = self._centre[faces.second] - self._centre[faces.first]
+        apart = self.centre[faces.second] - self.centre[faces.first]
         along = np.abs(np.einsum("fi,fi->f", apart, faces.normal))
         thickness = np.maximum(along, LEAST_THICKNESS * np.linalg.norm(apart, axis=1))[of_face] / size
         outer = normal[:, :, None] * normal[:, None, :]
@@ -386,7 +402,7 @@ class Glue:
         rows, columns, values = [], [], []
         row = np.arange(3 * len(corners)).reshape(-1, 3)
         for sign, bodies in ((-1.0, faces.first[of_face]), (1.0, faces.second[of_face])):
-            arm = (place - self._centre[bodies]) / size
+            arm = (place - self.centre[bodies]) / size
             number = np.searchsorted(pieces, bodies)
             block = np.zeros((len(corners), 3, 6))
             block[:, :, :3] = np.eye(3)
@@ -466,22 +482,31 @@ def _kron3(matrix: csc_matrix) -> Any:
     return kron(matrix, identity(3))
 
 
-def _faces_of(parameters: Sequence[RigidBodyParameters]) -> Faces:
-    """The faces between all pieces of bodies."""
-    first, second, strength, normal, triangles = [], [], [], [], []
-    wholes: dict[str, list[int]] = {}
+def _wholes_of(parameters: Sequence[RigidBodyParameters]) -> Iterator[Whole]:
+    """What all pieces are of."""
+    numbers: dict[str, list[int]] = {}
     for number, body in enumerate(parameters):
         if body.whole is not None:
-            wholes.setdefault(body.whole, []).append(number)
-    for numbers in wholes.values():
-        body = parameters[numbers[0]]
-        assert isinstance(body.shape, PieceShape) and body.breaks is not None, "pieces are made by what breaks"
-        for face in cut_of(body.shape).faces:
+            numbers.setdefault(body.whole, []).append(number)
+    for pieces in numbers.values():
+        shape, scale = parameters[pieces[0]].shape, parameters[pieces[0]].scale
+        assert isinstance(shape, PieceShape), "pieces are made by what breaks"
+        yield Whole(shape, scale, np.array(pieces))
+
+
+def _faces_of(parameters: Sequence[RigidBodyParameters], wholes: Sequence[Whole]) -> Faces:
+    """The faces between all pieces of bodies."""
+    first, second, strength, normal, triangles = [], [], [], [], []
+    for whole in wholes:
+        numbers = whole.pieces
+        breaks = parameters[numbers[0]].breaks
+        assert breaks is not None, "pieces are made by what breaks"
+        for face in cut_of(whole.shape).faces:
             first.append(numbers[face.first])
             second.append(numbers[face.second])
-            strength.append(body.breaks.strength)
+            strength.append(breaks.strength)
             normal.append(face.normal)
-            triangles.append(body.scale * face.triangles)
+            triangles.append(whole.scale * face.triangles)
     counts = [3 * len(each) for each in triangles]
     corners = np.concatenate([np.zeros((0, 3, 3)), *triangles])
     sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

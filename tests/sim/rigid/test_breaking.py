@@ -233,9 +233,7 @@ def test_a_blow_that_breaks_keeps_momentum_and_adds_no_energy():
 
 def test_pieces_come_to_rest_and_sleep():
     breaks = {"strength": 2e4, "pieces": 8, "seed": 1}
-    (*pieces,) = with_groups(
-        (body("block", cube(0.1), (0.0, 0.0, 0.6), density=2000.0, breaks=breaks),)
-    )
+    (*pieces,) = with_groups((body("block", cube(0.1), (0.0, 0.0, 0.6), density=2000.0, breaks=breaks),))
     solver = in_room(*pieces)
     advance(solver, 3.0)
     assert len(set(solver.glue.leader.tolist())) > 1
