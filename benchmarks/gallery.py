@@ -26,6 +26,7 @@ from render.sheet import contact_sheet
 JOBS = Path(__file__).resolve().parent.parent / "jobs"
 HEROES = {
     "ball_into_cloth": 34,
+    "brick_wall_in_flood": 24,
     "cloth_over_bunny": 22,
     "dam_break": 33,
     "drop_on_bunny_dfsph": 60,

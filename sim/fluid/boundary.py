@@ -1,7 +1,6 @@
 """Boundary samples on the device: of walls and static bodies, then of bodies that move, then of sheets."""
 
 import math
-from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -184,9 +183,8 @@ class Boundary:
             first_member=on_device(np.arange(body_count + 1, dtype=np.int32)),
             states=ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH),
         )
-        self._discretization = discretization
         self.mover = self._reference_mover = np.arange(body_count)
-        self._arm: NDArray[np.float64] | None = None  # of each body from what it moves with, as soon as some do
+        self._with_others = False  # whether bodies move with others
         self._before: NDArray[np.float64] | None = None  # where samples were before bodies moved with others
         self.sheets = Sheets(self.fixed_count + self.body_sample_count, self.body_sample_count, self.sheet_count)
         self._offset, self.moving = on_device(moving.positions), moving
@@ -215,30 +213,29 @@ class Boundary:
         """Numbers of samples that move with each body, (bodies,)."""
         return np.bincount(self.mover[self.moving.body], minlength=self.body_count)
 
-    def glue(self, mover: NDArray[np.int64], arm: NDArray[np.float64]) -> None:
+    def glue(
+        self,
+        mover: NDArray[np.int64],
+        arm: NDArray[np.float64],
+        rows: NDArray[np.int64],
+        position: NDArray[np.float64],
+        volume: NDArray[np.float64],
+    ) -> None:
         """Let bodies move with others: with which, and how far from its centre of mass [m], (n,) and (n, 3).
 
-        Arms are in the axes that all have that move together; emitters' pistons, the last bodies, are left out. Samples
-        of what moves together count each other in their volumes. `place` puts them where they are then.
+        Arms are in the axes that all have that move together; emitters' pistons, the last bodies, are left out. The
+        samples of some rows, (k,), are where they are about the centre of mass of their own body [m], (k, 3), with
+        volumes [m³], (k,), 0 where they do not count now. `place` puts them there.
         """
         pistons = self.body_count - len(mover)
         mover = np.append(mover, np.arange(len(mover), self.body_count))
         arm = np.concatenate([arm, np.zeros((pistons, 3))])
-        known, self._arm = self._arm, arm
-        other = mover != self.mover
-        if known is not None:
-            other |= (arm != known).any(axis=1)
-        if not other.any():
-            return
-        is_new = np.isin(self.mover, self.mover[other]) | np.isin(mover, mover[other])
-        rows = np.flatnonzero(is_new[self.moving.body])
-        self._before = self._positions()
         offset, volumes = self._host_offset.copy(), self._host_volume.copy()
-        own = self.moving.body[rows]
-        offset[rows] = self.moving.positions[rows].astype(np.float64) + arm[own]
-        glued = BoundarySamples(*(getattr(self.moving, field.name)[rows] for field in fields(BoundarySamples)))
-        glued = replace(glued, positions=offset[rows], body=mover[own].astype(np.int32))
-        volumes[rows] = glued.volumes(self._discretization.spacing, self._discretization.support_in_spacings)
+        offset[rows], volumes[rows] = position + arm[self.moving.body[rows]], volume
+        known = self._host_offset, self._host_volume, self.mover
+        if all(map(np.array_equal, (offset, volumes, mover), known)):
+            return
+        self._before, self._with_others = self._positions(), True
         self._put_deformed(offset, self._host_own_velocity, volumes)
         self._put_movers(mover)
 
@@ -332,7 +329,7 @@ class Boundary:
         if self._own_velocity is not None:
             arrays["body_offsets"], arrays["reference_body_offsets"] = self._host_offset, self._reference_offset
             arrays["body_offset_velocities"], arrays["body_volumes"] = self._host_own_velocity, self._host_volume
-        if self._arm is not None:
+        if self._with_others:
             arrays["body_movers"], arrays["reference_body_movers"] = self.mover, self._reference_mover
         if self.sheet_count:
             own = slice(self.sheets.first, self.count)
@@ -349,7 +346,7 @@ class Boundary:
             self._put_deformed(
                 arrays["reference_body_offsets"], arrays["body_offset_velocities"], arrays["body_volumes"]
             )
-        if self._arm is not None:
+        if self._with_others:
             self._put_movers(arrays["reference_body_movers"])
         self._place(arrays["reference_body_states"])
         if self.sheet_count:
@@ -361,7 +358,7 @@ class Boundary:
         if self._own_velocity is not None:
             self._put_deformed(arrays["body_offsets"], arrays["body_offset_velocities"], arrays["body_volumes"])
             self._deformed_by = 0.0
-        if self._arm is not None:
+        if self._with_others:
             self._put_movers(arrays["body_movers"])
             self._before = None
         self._place(arrays["body_states"])

@@ -157,9 +157,20 @@ def sink_samples(
     has as much less volume as leaves its field at the fluid that touches the surface the same. Where the body is too
     thin for the second layer, one layer stands for both: the first of two, alone, would keep nothing out.
     """
+    return sunk_layers(samples, signed_distance, spacing, support_in_spacings)[0]
+
+
+def sunk_layers(
+    samples: NDArray[np.floating],
+    signed_distance: SignedDistance,
+    spacing: float,
+    support_in_spacings: float = SUPPORT_IN_SPACINGS,
+) -> tuple[BoundarySamples, NDArray[np.int64]]:
+    """As `sink_samples`, and which sample of the surface each is made of, (k,)."""
     alone = wall_calibration(support_in_spacings)
     positions, _ = _sunk(samples, signed_distance, spacing, (alone.standoff_in_spacings - 0.5) * spacing)
     factor, layer = np.ones(len(positions)), np.zeros(len(positions), dtype=np.int32)
+    source = np.arange(len(positions))
     if support_in_spacings != SUPPORT_IN_SPACINGS:
         near, far = wall_layers(support_in_spacings)
         far_depth = (far.standoff_in_spacings - 0.5) * spacing
@@ -171,7 +182,8 @@ def sink_samples(
         near_factor = np.where(is_deep, near.volume_factor / alone.volume_factor, 1.0)
         factor = np.concatenate([near_factor, far.volume_factor / alone.volume_factor * weakened])
         layer = np.repeat(np.arange(2, dtype=np.int32), [len(samples), np.count_nonzero(is_deep)])
-    return BoundarySamples.of_points(positions, factor=factor, layer=layer)
+        source = np.append(source, np.flatnonzero(is_deep))
+    return BoundarySamples.of_points(positions, factor=factor, layer=layer), source
 
 
 def _sunk(

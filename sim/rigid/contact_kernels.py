@@ -14,8 +14,8 @@ MAX_FRICTION_STEPS = 12
 FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
 
 
-NORMAL, TANGENT, ARM, OWN = 0, 3, 9, 15
-LEAST, LOWEST, FRICTION, IMPULSE, CHANGE, AHEAD, SLIP = 21, 22, 23, 24, 27, 30, 33
+NORMAL, ARM, LEAST, LOWEST, OWN = 0, 3, 9, 10, 11
+IMPULSE, CHANGE, AHEAD, FRICTION, SLIP, TANGENT = 17, 20, 23, 26, 27, 28
 """Columns of what a contact is while its island is solved: arms are two, tangents of three numbers too; OWN is what it
 has of A: nn, 1 / nn, n1, n2, 11, 22. SLIP is κ of `friction_impulse`, from which the next sweep starts."""
 COLUMNS = 34

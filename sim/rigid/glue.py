@@ -8,7 +8,7 @@ In every step the layers carry the difference between what acts on each piece, a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,9 +23,11 @@ from sim.rigid.contacts import Array, Contacts, Indices
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.states import MovingBodies
 from sim.rigid.steps import groups_of
+from sim.rigid.supports import Supports, friction_pyramid, least_shares
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.cutting import cut_of
 from sim.shapes.parameters import PieceShape
+from sim.shapes.placement import PlacedSolid, build_rest_shape
 
 POISSON_RATIO = 0.2
 """Of brittle solids [-], about; Young's modulus does not change how loads are shared."""
@@ -35,6 +37,7 @@ TOGETHER = 0.9
 IMPACT_SPEED = 0.1
 """Approach from which on a contact is a blow, which lasts for a time of its own [m/s]: five steps of gravity."""
 CENTRIFUGAL_SHARE = 0.01  # of the strength: what turning must stress at least to be looked at without any contact
+TOUCHING = 1.0e-5  # gap of what may carry a body, in its sizes
 MOST_ROUNDS = 30  # in which a step is taken again because bodies broke in it
 
 
@@ -51,6 +54,18 @@ class Faces:
     share: Array  # of the area of its face that a corner stands for [m²], (c,)
 
 
+class Whole(NamedTuple):
+    """A body that was cut into pieces."""
+
+    shape: PieceShape  # of one of them
+    scale: float  # [-]
+    pieces: Indices  # numbers of their bodies, (p,)
+
+    def solid(self) -> PlacedSolid:
+        """What it is in one piece, in the axes of its pieces, about its own origin."""
+        return PlacedSolid(build_rest_shape(self.shape.of), self.scale, np.eye(3), np.zeros(3))
+
+
 class _Component(NamedTuple):
     """Pieces that hold together: how loads on them stress the faces between them."""
 
@@ -62,6 +77,16 @@ class _Component(NamedTuple):
     traction: csc_matrix  # on corners, of motions of the pieces but the first, (3 c, 6 (m - 1))
 
 
+class _Touching(NamedTuple):
+    """The contacts of a step, and what they do."""
+
+    contacts: Contacts  # in numbers of movers
+    pieces: tuple[Indices, Indices]  # the two bodies of each, (k,) each
+    friction: Array  # [-], (k,)
+    impulses: Array  # on their first bodies [N s], (k, 3)
+    load: Array  # impulses and their moments on all bodies, of what is no contact as well [N s], (n, 6)
+
+
 class Glue:
     """Which pieces hold together, and what they do as one.
 
@@ -69,6 +94,8 @@ class Glue:
         leader: number of the body that stands for all that a body is glued to, its own if for none, (n,).
         arm: from its leader's centre of mass to that of each body, in its own axes [m], (n, 3).
         movers: bodies that move on their own, at the numbers of their leaders; others mean nothing.
+        wholes: what the pieces are of.
+        centre: centre of mass of each body, in the axes and about the origin of its whole [m], (n, 3).
         faces: all faces between pieces, (f,).
         is_broken: of these, (f,) bool.
     """
@@ -78,10 +105,11 @@ class Glue:
     ) -> None:
         """Take all moving bodies, with pieces where their wholes place them; sets the velocities of the pieces."""
         self._bodies, n = bodies, len(bodies)
-        self._centre = np.array([geometry.centre_of_mass for geometry in geometries])
+        self.centre = np.array([geometry.centre_of_mass for geometry in geometries])
         self._is_piece = np.array([body.whole is not None for body in parameters])
         self._impact_s = np.array([1.0 if body.breaks is None else body.breaks.impact_s for body in parameters])
-        self.faces = _faces_of(parameters)
+        self.wholes = tuple(_wholes_of(parameters))
+        self.faces = _faces_of(parameters, self.wholes)
         self.is_broken: NDArray[np.bool_] = np.zeros(len(self.faces.first), dtype=bool)
         self.leader, self.arm = np.arange(n), np.zeros((n, 3))
         self._known: dict[int, _Component] = {}
@@ -133,8 +161,8 @@ class Glue:
         for leader in np.unique(self.leader[pieces]):
             mine = pieces[self.leader[pieces] == leader]
             total = mass[mine].sum()
-            centre = mass[mine] @ self._centre[mine] / total
-            self.arm[mine] = self._centre[mine] - centre
+            centre = mass[mine] @ self.centre[mine] / total
+            self.arm[mine] = self.centre[mine] - centre
             arms = self.arm[mine]
             squares = np.einsum("ni,ni->n", arms, arms)[:, None, None] * np.eye(3)
             spread = mass[mine, None, None] * (squares - arms[:, :, None] * arms[:, None, :])
@@ -209,6 +237,7 @@ class Glue:
         self,
         contacts: Contacts,
         pieces: tuple[Indices, Indices],
+        friction: Array,
         impulses: Array,
         velocity: tuple[Array, Array],
         dt: float,
@@ -219,6 +248,7 @@ class Glue:
         Args:
             contacts: of the step, in numbers of movers.
             pieces: the two bodies of each contact, (k,) each.
+            friction: of the contacts [-], (k,).
             impulses: of the contacts on their first bodies [N s], (k, 3).
             velocity: of the movers before the contacts, [m/s] and [rad/s], (n, 3) each.
             dt: the step [s].
@@ -232,11 +262,12 @@ class Glue:
             np.add.at(load, own[rows], wrench)
         is_hit = self._struck(contacts, impulses, velocity)[self.leader]
         # A blow is what is more than the force of before; it may be in two steps, as gaps close in the first.
-        is_struck = is_hit | self._was_hit
-        blow = np.where(is_struck[:, None], load - dt * self._rest, 0.0)
-        force = np.where(is_struck[:, None], self._rest + (blow + self._blow) / self._impact_s[:, None], load / dt)
+        is_struck = (is_hit | self._was_hit)[:, None]
+        more, blow_s = load - dt * self._rest, self._impact_s[:, None]
+        blow = np.where(is_struck, more, 0.0)
+        force = self._rest + np.where(is_struck, (blow + self._blow) / blow_s, more / np.maximum(blow_s, dt))
         active = is_active & self._is_piece
-        rest = np.where((active & ~is_struck)[:, None], load / dt, self._rest)
+        rest = np.where(active[:, None] & ~is_struck, force, self._rest)
         self._next = (
             rest,
             np.where(active[:, None], blow, self._blow),
@@ -244,8 +275,9 @@ class Glue:
             np.where(active, is_hit, self._was_hit),
         )
         broken = [np.zeros(0, dtype=np.int64)]
-        for leader in np.unique(self.leader[active & self.is_glued]):
-            broken.append(self._overloaded_of(int(leader), force))
+        touching = _Touching(contacts, pieces, friction, impulses, load)
+        for leader in map(int, np.unique(self.leader[active & self.is_glued])):
+            broken.append(self._overloaded_of(leader, force, touching))
         return np.concatenate(broken)
 
     def settle(self) -> None:
@@ -274,20 +306,35 @@ class Glue:
         result: NDArray[np.bool_] = struck[groups[:n]]
         return result
 
-    def _overloaded_of(self, leader: int, force: Array) -> Indices:
-        """Faces of one body that do not hold under forces [N] and torques [N m] on its pieces, (n, 6)."""
+    def _overloaded_of(self, leader: int, force: Array, touching: _Touching) -> Indices:
+        """Faces of one body that do not hold under forces [N] and torques [N m] on its pieces, (n, 6).
+
+        Where some would not, what it stands on may share the load in another way.
+        """
         if leader not in self._known:
             self._known[leader] = self._component(leader)
-        found, movers, bodies = self._known[leader], self.movers, self._bodies
-        pieces, none = found.pieces, np.zeros(0, dtype=np.int64)
+        found, movers = self._known[leader], self.movers
         turned = rotation.matrices(movers.orientation[leader])
         spin = turned.T @ movers.angular_velocity[leader]
+        farthest = float(np.square(self.arm[found.pieces]).sum(axis=1).max())
+        density = self._bodies.mass[found.pieces].sum() / found.size**3
+        least = CENTRIFUGAL_SHARE * self.faces.strength[found.faces].min()
+        if not force[found.pieces].any() and density * (spin @ spin) * farthest < least:
+            return np.zeros(0, dtype=np.int64)
+        load = self._unbalanced(found, leader, force, turned, spin)
+        use = self._use(found, load)
+        if use.max(initial=0.0) > 1.0:
+            supports = self._supports(found, leader, force, touching, turned)
+            use = self._use(found, load + _relief(found, supports, load)) if len(supports.piece) else use
+        return found.faces[(use > 1.0) & (use >= TOGETHER * use.max())]
+
+    def _unbalanced(self, found: _Component, leader: int, force: Array, turned: Array, spin: Array) -> Array:
+        """What acts on pieces less what their part of the acceleration takes [N], (m, 6), in the body's axes.
+
+        Moments are divided by the size.
+        """
+        pieces, movers, bodies = found.pieces, self.movers, self._bodies
         arms, mass, tensors = self.arm[pieces], bodies.mass[pieces], bodies.tensors[pieces]
-        strength = self.faces.strength[found.faces]
-        farthest = float(np.square(arms).sum(axis=1).max())
-        density = mass.sum() / found.size**3
-        if not force[pieces].any() and density * (spin @ spin) * farthest < CENTRIFUGAL_SHARE * strength.min():
-            return none
         own_force, torque = force[pieces, :3] @ turned, force[pieces, 3:] @ turned
         inertia = movers.tensors[leader]
         total = (torque + np.cross(arms, own_force)).sum(axis=0)
@@ -296,8 +343,12 @@ class Glue:
         acceleration = acceleration + np.cross(spin_up, arms) + np.cross(spin, np.cross(spin, arms))
         own_force = own_force - mass[:, None] * acceleration
         torque = torque - (tensors @ spin_up + np.cross(spin, tensors @ spin))
-        load = np.concatenate([own_force, torque / found.size], axis=1)[1:].ravel()
-        traction = (found.traction @ found.stiffness.solve(load)).reshape(-1, 3) / found.size**2
+        return np.concatenate([own_force, torque / found.size], axis=1)
+
+    def _use(self, found: _Component, load: Array) -> Array:
+        """Largest stress on each face that holds, of loads on pieces [N], (m, 6), over its strength [-], (f,)."""
+        motion = found.stiffness.solve(load[1:].ravel())
+        traction = (found.traction @ motion).reshape(-1, 3) / found.size**2
         faces = self.faces
         normal = faces.normal[faces.corner_face[found.corners]]
         pull = np.einsum("ci,ci->c", traction, normal)
@@ -305,8 +356,32 @@ class Glue:
         stress = 0.5 * pull + np.sqrt(0.25 * pull * pull + shear)
         largest = np.zeros(len(self.is_broken))
         np.maximum.at(largest, faces.corner_face[found.corners], stress)
-        use = largest[found.faces] / strength
-        return found.faces[(use > 1.0) & (use >= TOGETHER * use.max())]
+        use: Array = largest[found.faces] / faces.strength[found.faces]
+        return use
+
+    def _supports(self, found: _Component, leader: int, force: Array, touching: _Touching, turned: Array) -> Supports:
+        """What carries a body that forces [N], (n, 6), act on: all that touches it, whatever it carries now."""
+        contacts, n = touching.contacts, len(self.leader)
+        is_free = np.append(self.movers.is_free, False)
+        pushes, loads = force[found.pieces, :3], touching.load[found.pieces, :3]
+        per_impulse = float((pushes * loads).sum() / max(float(np.square(loads).sum()), np.finfo(float).tiny))
+        carried, parts = per_impulse * touching.impulses, []
+        for sign, own, others, of_piece in (
+            (1.0, contacts.first, contacts.second, touching.pieces[0]),
+            (-1.0, contacts.second, contacts.first, touching.pieces[1]),
+        ):
+            near = carried.any(axis=1) | (contacts.gap <= TOUCHING * found.size)
+            rows = np.flatnonzero((own == leader) & near)
+            normal, pushed = sign * contacts.normal[rows] @ turned, sign * carried[rows] @ turned
+            forces, shares = friction_pyramid(normal, pushed, touching.friction[rows])
+            piece = np.searchsorted(found.pieces, of_piece[rows])
+            place = (contacts.point[rows] - self._bodies.position[of_piece[rows]]) @ turned
+            other = np.minimum(others[rows], n)
+            other = np.where(is_free[other], other, n)  # what stands or is led is one support
+            arm = place + self.arm[found.pieces[piece]]
+            for unit, share in zip(forces, shares, strict=True):
+                parts.append(Supports(piece, unit, np.cross(place, unit), arm, other, share))
+        return Supports(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def _component(self, leader: int) -> _Component:
         """The stiffness of what a leader leads."""
@@ -317,7 +392,7 @@ class Glue:
         of_face = faces.corner_face[corners]
         place, normal = faces.corner[corners], faces.normal[of_face]
         size = float(np.ptp(place, axis=0).max())
-        apart = self._centre[faces.second] - self._centre[faces.first]
+        apart = self.centre[faces.second] - self.centre[faces.first]
         along = np.abs(np.einsum("fi,fi->f", apart, faces.normal))
         thickness = np.maximum(along, LEAST_THICKNESS * np.linalg.norm(apart, axis=1))[of_face] / size
         outer = normal[:, :, None] * normal[:, None, :]
@@ -327,7 +402,7 @@ class Glue:
         rows, columns, values = [], [], []
         row = np.arange(3 * len(corners)).reshape(-1, 3)
         for sign, bodies in ((-1.0, faces.first[of_face]), (1.0, faces.second[of_face])):
-            arm = (place - self._centre[bodies]) / size
+            arm = (place - self.centre[bodies]) / size
             number = np.searchsorted(pieces, bodies)
             block = np.zeros((len(corners), 3, 6))
             block[:, :, :3] = np.eye(3)
@@ -387,6 +462,19 @@ class Glue:
 _STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost", "is_pushed")
 
 
+def _relief(found: _Component, supports: Supports, load: Array) -> Array:
+    """How loads on pieces [N], (m, 6), change as supports share what they carry with the least energy."""
+    k, rows = len(supports.piece), np.arange(len(supports.piece))
+    of_each = np.zeros((k, *load.shape))
+    of_each[rows, supports.piece, :3], of_each[rows, supports.piece, 3:] = supports.force, supports.moment / found.size
+    columns = of_each[:, 1:].reshape(k, -1)
+    unsupported = load - np.tensordot(supports.carried, of_each, axes=1)
+    motions = found.stiffness.solve(np.ascontiguousarray(columns.T))
+    shares = least_shares(supports, columns @ motions, motions.T @ unsupported[1:].ravel(), found.size)
+    change: Array = np.tensordot(shares - supports.carried, of_each, axes=1)
+    return change
+
+
 def _kron3(matrix: csc_matrix) -> Any:
     """A matrix of numbers as one of vectors of three."""
     from scipy.sparse import identity, kron
@@ -394,22 +482,31 @@ def _kron3(matrix: csc_matrix) -> Any:
     return kron(matrix, identity(3))
 
 
-def _faces_of(parameters: Sequence[RigidBodyParameters]) -> Faces:
-    """The faces between all pieces of bodies."""
-    first, second, strength, normal, triangles = [], [], [], [], []
-    wholes: dict[str, list[int]] = {}
+def _wholes_of(parameters: Sequence[RigidBodyParameters]) -> Iterator[Whole]:
+    """What all pieces are of."""
+    numbers: dict[str, list[int]] = {}
     for number, body in enumerate(parameters):
         if body.whole is not None:
-            wholes.setdefault(body.whole, []).append(number)
-    for numbers in wholes.values():
-        body = parameters[numbers[0]]
-        assert isinstance(body.shape, PieceShape) and body.breaks is not None, "pieces are made by what breaks"
-        for face in cut_of(body.shape).faces:
+            numbers.setdefault(body.whole, []).append(number)
+    for pieces in numbers.values():
+        shape, scale = parameters[pieces[0]].shape, parameters[pieces[0]].scale
+        assert isinstance(shape, PieceShape), "pieces are made by what breaks"
+        yield Whole(shape, scale, np.array(pieces))
+
+
+def _faces_of(parameters: Sequence[RigidBodyParameters], wholes: Sequence[Whole]) -> Faces:
+    """The faces between all pieces of bodies."""
+    first, second, strength, normal, triangles = [], [], [], [], []
+    for whole in wholes:
+        numbers = whole.pieces
+        breaks = parameters[numbers[0]].breaks
+        assert breaks is not None, "pieces are made by what breaks"
+        for face in cut_of(whole.shape).faces:
             first.append(numbers[face.first])
             second.append(numbers[face.second])
-            strength.append(body.breaks.strength)
+            strength.append(breaks.strength)
             normal.append(face.normal)
-            triangles.append(body.scale * face.triangles)
+            triangles.append(whole.scale * face.triangles)
     counts = [3 * len(each) for each in triangles]
     corners = np.concatenate([np.zeros((0, 3, 3)), *triangles])
     sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -280,7 +280,8 @@ class RigidSolver:
             self._detector.keep_forces(outcome.forces)
         if glue is not None and isinstance(self._detector, PartsDetector):
             contacts, pieces = self._detector.contacts(), self._detector.pieces
-            broken = glue.overloaded(contacts, pieces, outcome.impulses, unstopped, dt, everybody)
+            friction = self.surfaces.of_pairs(*pieces)[0]
+            broken = glue.overloaded(contacts, pieces, friction, outcome.impulses, unstopped, dt, everybody)
             if len(broken) and rounds > 0:
                 bodies.velocity, bodies.angular_velocity = velocities
                 glue.scatter()

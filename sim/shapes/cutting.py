@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Voronoi
 
 from sim.shapes.assembly import BODY_PART, Assembly, manifold_of, mesh_of
-from sim.shapes.mesh_solid import ConvexSolid
+from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
 from sim.shapes.parameters import CompoundShape, MeshShape, PieceShape, Shape
 from sim.shapes.placement import PlacedSolid, build_rest_shape
 from sim.shapes.solid import RestShape, ShapeError, TriangleMesh
@@ -60,6 +60,24 @@ def build_piece(shape: PieceShape) -> RestShape:
 def cut_of(shape: PieceShape) -> Cut:
     """All pieces of the shape that one is of."""
     return _cut(shape.of, shape.pieces, shape.seed, tuple(_states_of_files(shape.of)))
+
+
+def united(pieces: Sequence[RestShape]) -> MeshSolid:
+    """The solid that some pieces of one cut fill together: no surface is left where they touch.
+
+    Each is made larger by a millionth about its middle, so that rounding leaves no gaps between them.
+    """
+    import manifold3d
+
+    manifolds = []
+    for number, piece in enumerate(pieces):
+        mesh = piece.surface_mesh(None)
+        middle = mesh.vertices.mean(axis=0)
+        larger = middle + (1.0 + SAME_PLANE) * (mesh.vertices - middle)
+        manifolds.append(manifold_of(TriangleMesh(larger, mesh.faces), f"piece {number + 1}"))
+    union = manifold3d.Manifold.batch_boolean(manifolds, manifold3d.OpType.Add)
+    parts = {manifold.original_id(): 0 for manifold in manifolds}
+    return Assembly(mesh_of(union, parts, (BODY_PART,)))
 
 
 def _states_of_files(shape: Shape) -> Iterator[tuple[int, int]]:

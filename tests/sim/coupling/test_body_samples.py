@@ -5,7 +5,7 @@ import pytest
 from coupled_tanks import SPACING, Tank
 
 from sim.core.domain import DomainParameters
-from sim.coupling.fluid_rigid import LEAST_FACTOR, completing_factors, least_factor
+from sim.coupling.completion import LEAST_FACTOR, completing_factors, least_factor
 from sim.fluid.boundary_akinci2012 import BoundarySamples, sink_samples
 from sim.fluid.kernels import evaluate
 from sim.rigid.parameters import RigidBodyParameters

@@ -31,9 +31,9 @@ def test_water_moves_what_is_glued_as_it_moves_the_whole(taichi_cpu):
         tank.run(0.06)
     movers = glued.rigid.glue.movers
     assert whole.rigid.bodies.velocity[0, 0] > 1.0
-    # The box has samples where its pieces meet, too: velocities differ by some percent of the largest.
-    np.testing.assert_allclose(movers.velocity[0], whole.rigid.bodies.velocity[0], atol=0.04)
-    np.testing.assert_allclose(movers.position[0], whole.rigid.bodies.position[0], atol=0.003)
+    # Both have the same samples; sums over pieces round in another order, which a splash makes larger.
+    np.testing.assert_allclose(movers.velocity[0], whole.rigid.bodies.velocity[0], atol=0.004)
+    np.testing.assert_allclose(movers.position[0], whole.rigid.bodies.position[0], atol=0.0003)
 
 
 @pytest.mark.parametrize("solver", ["dfsph", "wcsph"])
