@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from sim.core.arrays import Floats
 from sim.core.bundles import func
-from sim.core.host_access import copied
 from sim.core.launch import kernel
 from sim.core.solver import Arrays, SimulationDivergedError
 from sim.core.world import World
@@ -29,12 +28,13 @@ from sim.smoke.arrays import Faces, new_faces
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid, cell_counts, fill_row, lane_items, lane_place, row_start, steps
 from sim.smoke.obstacles import Air, flux_part
-from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
+from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up
 
 RESPONSE_FRAMES = 1.0
 """Time tau in which the fine smoke takes on the guide's motion, in frames."""
 NOT_GUIDED = 1.0e30
 """Marks faces that a guide says nothing about [m/s]."""
+COUNT_AND_PRODUCT, FIRST, SECOND = range(3)  # moments of two velocities
 
 
 class CoarseSmoke(Protocol):
@@ -49,6 +49,10 @@ class CoarseSmoke(Protocol):
     air: Air
     grid: SmokeGrid
     refusal: Callable[[float], str | None] | None
+
+    @property
+    def unfinished_solves(self) -> int:
+        """Projections of the frame that have hit their limit."""
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at a simulated time [s]."""
@@ -107,21 +111,24 @@ class Guide:
         Of all guided faces off the mean of each component; 1 where both are at rest.
         """
         coarse = self._smoke.air
-        _find_missing(air, coarse, self._before, self._missing, self._first(grid), self._refinement, 1.0, NOT_GUIDED)
+        given = self._before, self._missing, self._first(grid), self._refinement, 1.0
+        _find_missing(air, coarse, *given, NOT_GUIDED)
         both = square = own_square = 0.0
         for missing, now in zip(self._missing, coarse.state.velocity, strict=True):
-            guided = (lacking := copied(missing)) < 0.5 * NOT_GUIDED
-            given = copied(now)[guided].astype(np.float64)
-            own = given - lacking[guided]
-            given, own = (values - (values.mean() if len(values) else 0.0) for values in (given, own))
-            both, square, own_square = both + given @ own, square + given @ given, own_square + own @ own
+            arrays, rows = (coarse.box, missing, now), self._rows
+            count = _sum_moments(*arrays, 0.0, 0.0, COUNT_AND_PRODUCT, rows)[0]
+            if count > 0.0:
+                means = [total / count for total in _sum_moments(*arrays, 0.0, 0.0, FIRST, rows)]
+                squares = _sum_moments(*arrays, *means, SECOND, rows)
+                square, own_square = square + squares[0], own_square + squares[1]
+                both += _sum_moments(*arrays, *means, COUNT_AND_PRODUCT, rows)[1]
         if square == own_square == 0.0:
             return 1.0
-        return float(both / math.sqrt(square * own_square)) if square * own_square > 0.0 else 0.0
+        return both / math.sqrt(square * own_square) if square * own_square > 0.0 else 0.0
 
-    def unfinished_solves(self) -> float:
+    def unfinished_solves(self) -> int:
         """How many of its projections of the frame have hit their limit."""
-        return sum(numbers.get("not_converged", 0.0) for numbers in self._world.diagnostics().values())
+        return self._smoke.unfinished_solves
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Its world at the end of a frame."""
@@ -143,7 +150,7 @@ class Guide:
         if not self._is_due:
             return
         try:
-            self._world.advance_frame()
+            self._world.go_to_next_frame()
         except SimulationDivergedError as error:
             finding = f"{error.quantity}, in the simulation that guides it"
             raise SimulationDivergedError(error.body, error.frame, error.time_s, finding, error.hint) from error
@@ -201,6 +208,39 @@ def _find_missing(
                 if mean.y == 1.0:
                     value = earlier[at] + part * (now[at] - earlier[at]) - mean.x
                 out[at] = value
+
+
+@kernel
+def _sum_moments(
+    box: Grid,
+    missing: Floats,
+    given: Floats,
+    given_mean: ti.f32,
+    own_mean: ti.f32,
+    moments: ti.template(),
+    rows: Rows,
+) -> Pair:
+    """Sums over guided faces of 1 and a b, of a and b, or of their squares: a of the guide, b of the fine smoke."""
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        first = 0.0
+        second = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            counts = missing[at] < 0.5 * NOT_GUIDED
+            a = ti.select(counts, given[at] - given_mean, 0.0)
+            b = ti.select(counts, given[at] - missing[at] - own_mean, 0.0)
+            if ti.static(moments == COUNT_AND_PRODUCT):
+                first += ti.select(counts, 1.0, 0.0)
+                second += a * b
+            elif ti.static(moments == FIRST):
+                first += a
+                second += b
+            else:
+                first += a * a
+                second += b * b
+        rows.partial[partial_place(box, i, j, lane)] = ti.Vector([first, second])
+    sum_up(rows)
+    return rows.nodes[0]
 
 
 @func

@@ -353,7 +353,7 @@ class SmokeSolver:
             "iterations": float(sum(report.iterations for report in self._projections)),
             "residual": max((report.residual for report in self._projections), default=0.0),
             "divergence": max((report.divergence for report in self._projections), default=0.0),
-            "not_converged": float(sum(not report.converged for report in self._projections)),
+            "not_converged": float(self.unfinished_solves),
         }
         if self._combustion is not None:
             numbers["fuel"] = float((self._cells("fuel") * volume).sum()) * self.grid.cell_size**3
@@ -366,6 +366,11 @@ class SmokeSolver:
         if self.obstacles.moving:
             numbers["compression"] = max((report.compression for report in self._projections), default=0.0)
         return numbers
+
+    @property
+    def unfinished_solves(self) -> int:
+        """Projections of the frame that have hit their limit."""
+        return sum(not report.converged for report in self._projections)
 
     def remedies(self) -> Remedies:
         """Smaller steps; larger cells, or slower air, cross less in one."""
