@@ -221,3 +221,17 @@ def test_gusts_of_a_guide_are_as_large_as_its_cells_carry():
     smoke = SmokeParameters(name="smoke", source=[PLUME], upres=4, cell_size=0.02, turbulence={"strength": 1.0})
     assert smoke.guide.turbulence.size == pytest.approx(0.2)
     assert smoke.model_copy(update={"cell_size": 0.05}).guide.turbulence.size == pytest.approx(0.4)
+
+
+def test_a_guided_plume_is_the_same_with_many_threads_a_row(monkeypatch):
+    velocities = []
+    for on_gpu in (False, True):
+        for module in ("sim.core.reductions", "sim.core.scheduling", "sim.smoke.lanes"):
+            monkeypatch.setattr(f"{module}.runs_on_gpu", lambda is_gpu=on_gpu: is_gpu)
+        solver = smoke_of(world_of(scene(), 3))
+        velocities.append((faces(solver), solver.diagnostics()["guide_correlation"]))
+    (one, first), (many, second) = velocities
+    # Sums of conjugate gradients have another order, and they stop at 1e-5 of the largest speed.
+    largest = max(np.abs(values).max() for values in one)
+    assert max(np.abs(a - b).max() for a, b in zip(one, many, strict=True)) < 1.0e-4 * largest
+    assert first == pytest.approx(second, abs=1.0e-4)
