@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from thread_counts import digest_of, result_on_any_threads
 
 from sim.build import build_world
 from sim.core.solver import OutgrownError, SimulationDivergedError
@@ -235,3 +236,12 @@ def test_a_guided_plume_is_the_same_with_many_threads_a_row(monkeypatch):
     largest = max(np.abs(values).max() for values in one)
     assert max(np.abs(a - b).max() for a, b in zip(one, many, strict=True)) < 1.0e-4 * largest
     assert first == pytest.approx(second, abs=1.0e-4)
+
+
+def digest_of_a_guided_plume() -> tuple[str, float]:
+    world = world_of(scene(**CASES["swept"]), 3)
+    return digest_of(world.checkpoint()), smoke_of(world).diagnostics()["guide_correlation"]
+
+
+def test_a_guided_plume_has_the_same_bits_on_any_number_of_threads():
+    result_on_any_threads(digest_of_a_guided_plume)
