@@ -43,6 +43,7 @@ from sim.rigid.solver import RigidSolver
 from sim.rigid.start import check_start
 from sim.rigid.states import StaticBody
 from sim.shapes.placement import SharedShapes, build_solid
+from sim.smoke.guide import Guide
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.smoke.solver import SmokeSolver
 from sim.soft.parameters import coarse_for_fluid
@@ -94,7 +95,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
     around = static, rigid, samples, next(iter(softs), None)
     fluids = [_build_fluids(scene, *around, forces)] if scene.fluid else []
-    smokes = [_build_smoke(smoke, scene, static, forces, 1.0 / frames_per_second) for smoke in scene.smoke]
+    smokes = [_build_smoke(smoke, scene, static, forces, frames_per_second) for smoke in scene.smoke]
     coupled: list[Solver] = [*fluids, *cloths, *softs, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
@@ -282,9 +283,9 @@ def _build_smoke(
     scene: SceneParameters,
     static: Sequence[StaticBody],
     forces: ForceField | None,
-    frame_s: float,
+    frames_per_second: float,
 ) -> SmokeSolver:
-    """The solver of one smoke, with static bodies in it, and room for what will move in it."""
+    """The solver of one smoke, with static bodies in it, room for what will move in it, and its guide."""
     return SmokeSolver(
         with_sources_on(smoke, scene.rigid),
         domain=scene.domain,
@@ -292,8 +293,21 @@ def _build_smoke(
         solids=[body.solid for body in static],
         moving=_meets_particles(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
         forces=forces,
-        frame_s=frame_s,
+        frame_s=1.0 / frames_per_second,
+        guide=_build_guide(smoke, scene, frames_per_second) if smoke.upres > 1 else None,
     )
+
+
+def _build_guide(smoke: SmokeParameters, scene: SceneParameters, frames_per_second: float) -> Guide:
+    """The same scene in coarser cells, with this smoke alone and without what the air carries."""
+    coarse = scene.model_copy(update={"smoke": (smoke.guide,), "embers": ()})
+    try:
+        world = build_world(coarse, frames_per_second=frames_per_second)
+    except ValueError as error:
+        raise ValueError(f"upres: in the guide's cells of {smoke.guide.cell_size:g} m: {error}") from error
+    solver = world.solvers[smoke.name]
+    assert isinstance(solver, SmokeSolver)
+    return Guide(world, solver, refinement=smoke.upres, frame_s=1.0 / frames_per_second)
 
 
 def _meets_particles(smoke: SmokeParameters, scene: SceneParameters) -> bool:

@@ -137,6 +137,22 @@ class SceneParameters(Parameters):
         return self
 
     @model_validator(mode="after")
+    def _has_guides_of_what_is_known_before(self) -> Self:
+        """What a smoke pushes, or waits for, would go another way in its guide."""
+        moving = any(body.kind == "dynamic" for body in self.rigid)
+        others = {"fluid": self.fluid, "cloth": self.cloth, "soft matter": self.soft, "dynamic bodies": moving}
+        other = next((name for name, there in others.items() if there), None)
+        for number, smoke in enumerate(self.smoke):
+            if smoke.upres > 1 and other is not None:
+                raise KeyRefusedError(
+                    ("smoke", number, "upres"),
+                    f"{smoke.upres} is of a smoke in a job with {other}, which would move otherwise in the coarser "
+                    "simulation that guides it; leave it out, or have nothing there but bodies that stand still or "
+                    "follow keyframes",
+                )
+        return self
+
+    @model_validator(mode="after")
     def _has_one_air(self) -> Self:
         if self.smoke and (conflict := conflict_in_one_air(self.cloth)):
             raise KeyRefusedError(*conflict)

@@ -76,6 +76,7 @@ _KNOWN = {
         Quantity("residual", "residual", "", "Residual"),
         Quantity("divergence", "largest divergence", "1/s", "Divergence"),
         Quantity("compression", "compression of closed air", "1/s", "Compression of closed air"),
+        Quantity("guide_correlation", "correlation with the guide", SHARE, "Correlation with the guide"),
         Quantity("cells", "cells of the window", "", "Cells of the window", counted=True),
         Quantity("not_converged", "solves at their iteration limit", "", "Solves at their limit", counted=True),
         Quantity("squeezed", "squeezed beyond 20 %", "", "Frames with squeezed particles", counted=True),

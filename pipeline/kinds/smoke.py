@@ -71,6 +71,8 @@ def _coarser(job: Job, factor: float, solids: SolidBuilder | None) -> list[Chang
     if job.smoke and solids is not None:
         cell_sizes = coarser_cell_sizes(job, factor, solids())
     for index, (smoke, cell_size) in enumerate(zip(job.smoke, cell_sizes, strict=True)):
+        if smoke.upres > 1 and solids is not None:
+            changes.append((("smoke", index, "upres"), 1))
         changes.append((("smoke", index, "cell_size"), cell_size))
         gusts = smoke.turbulence
         if gusts.strength > 0.0 and gusts.size < CELLS_PER_EDDY * cell_size:

@@ -21,6 +21,7 @@ from sim.cloth.parameters import substeps_of
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.parameters import is_implicit
 from sim.fluid.traits import TRAITS, VISCOUS_NUMBER
+from sim.smoke.parameters import SmokeParameters
 
 
 class GpuRates(NamedTuple):
@@ -46,6 +47,8 @@ CELL_STEP_S = 0.25e-6
 """Core time of a cell in a step of smoke [s]."""
 CELL_STEP_LAUNCHES_S = 35e-3
 """Time of launches of a step of smoke, however few its cells [s]."""
+GUIDING_SHARE = 0.1
+"""Time that being drawn to a guide adds to a step of smoke, over it [-]."""
 RISING_SHARE = 0.7
 """Largest speed of buoyant smoke over that of a free rise through its box."""
 PASSING_FACTOR = 2.0
@@ -211,13 +214,21 @@ def cloth_work(job: Job, nodes: float, on_gpu: bool) -> Work:
 
 
 def smoke_work(job: Job, cells: float, on_gpu: bool) -> Work:
-    """Of a frame of all smokes, of this many cells."""
+    """Of a frame of all smokes, of this many cells, with their guides."""
     steps = max(_smoke_steps(job, index) for index in range(len(job.smoke)))
+    guided = [smoke for smoke in job.smoke if smoke.upres > 1]
+    computed = cells * (1.0 + max(map(guide_share, guided), default=0.0))
+    launches = steps * (len(job.smoke) + sum(1.0 / smoke.upres for smoke in guided))
     if not on_gpu:
-        return _on_reference(steps * cells * CELL_STEP_S, steps * len(job.smoke) * CELL_STEP_LAUNCHES_S)
+        return _on_reference(steps * computed * CELL_STEP_S, launches * CELL_STEP_LAUNCHES_S)
     rates = GPU_RATES["smoke"]
-    host_s = steps * len(job.smoke) * rates.step_s + cells * CELL_FRAME_S
-    return _on_reference(steps * cells * rates.element_s, host_s, on_gpu=True)
+    host_s = launches * rates.step_s + cells * CELL_FRAME_S
+    return _on_reference(steps * computed * rates.element_s, host_s, on_gpu=True)
+
+
+def guide_share(smoke: SmokeParameters) -> float:
+    """Time of a guide, and of being guided, over that of the smoke's own steps."""
+    return smoke.upres**-4 + GUIDING_SHARE
 
 
 def soft_work(job: Job, particles: float, on_gpu: bool) -> Work:

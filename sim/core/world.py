@@ -93,7 +93,15 @@ class World:
             coupling.resume()
 
     def advance_frame(self) -> FrameReport:
-        """Advance to the next frame.
+        """Advance to the next frame, and look at it.
+
+        Raises SimulationDivergedError: as `go_to_next_frame`.
+        """
+        substeps, smallest_dt = self.go_to_next_frame()
+        return FrameReport(self.frame, self.time_s, substeps, smallest_dt, self.diagnostics())
+
+    def go_to_next_frame(self) -> tuple[dict[str, int], dict[str, float]]:
+        """Advance to the next frame; returns the substeps that it took and the smallest of them [s], by solver.
 
         Raises:
             SimulationDivergedError: the state became non-finite or ran away, the step size collapsed, or `watch` found
@@ -112,7 +120,7 @@ class World:
                 substeps |= dict.fromkeys((solver.name for solver in team.solvers), team.taken)
                 smallest_dt |= dict.fromkeys((solver.name for solver in team.solvers), team.smallest_dt_s)
         self.frame += 1
-        return FrameReport(self.frame, self.time_s, substeps, smallest_dt, self.diagnostics())
+        return substeps, smallest_dt
 
     def diagnostics(self) -> dict[str, Diagnostics]:
         """Physics and numerics of the frame just computed, by solver."""

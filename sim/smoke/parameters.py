@@ -21,6 +21,7 @@ from sim.shapes.parameters import Placement
 
 WHOLE = 1.0e-6  # part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001
 MOST_CELLS = 2**30  # of one smoke, 1024 along each edge: a job with more is refused, a file of more was never written
+MOST_UPRES = 4  # cells of a guide over those of its smoke: coarser ones have hardly any motion of the film's
 CELLS_PER_EDDY = 2.0  # eddies of gusts are at least so many cells wide: the grid carries nothing finer
 
 Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]
@@ -154,6 +155,11 @@ class SmokeParameters(Parameters):
         default=0.02,
         description="Edge of a cubic cell [m]; air passes through walls of bodies that are thinner than one.",
     )
+    upres: Annotated[int, Field(ge=1, le=MOST_UPRES)] = Field(
+        default=1,
+        description="How many times longer the cells of a simulation are that guides it [-]: what goes where is as "
+        "there, and this one adds what is smaller. 1: none does.",
+    )
     open_faces: Faces = Field(
         default=("x-", "x+", "y-", "y+", "z+"), description="Sides through which air and smoke may pass."
     )
@@ -237,6 +243,14 @@ class SmokeParameters(Parameters):
                 "has no room in a box without open faces, as its air cannot be compressed; set it to 0, or open a side",
             )
         return self
+
+    @property
+    def guide(self) -> SmokeParameters:
+        """The smoke that guides it: in larger cells, with gusts that these can carry; as `--preview` draws it."""
+        cell_size, gusts = self.upres * self.cell_size, self.turbulence
+        if gusts.strength > 0.0:
+            gusts = gusts.model_copy(update={"size": max(gusts.size, CELLS_PER_EDDY * cell_size)})
+        return self.model_copy(update={"upres": 1, "cell_size": cell_size, "turbulence": gusts})
 
     @property
     def hottest_excess(self) -> float:

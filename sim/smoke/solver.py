@@ -24,6 +24,7 @@ from sim.smoke.combustion import Combustion
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import accelerate, cool, upward
 from sim.smoke.grid import Index3, SmokeGrid, Window
+from sim.smoke.guide import Guide
 from sim.smoke.lanes import lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air, AirForce, Obstacles, time_of_travel
 from sim.smoke.outer_forces import OuterForces, OutsideAir
@@ -69,6 +70,7 @@ class SmokeSolver:
         air_forces: what pushes the air from outside, in this order in every substep.
         sources: where smoke comes from, in the order of the parameters.
         refusal: of more cells (`Grows`).
+        guide: what its large motion is drawn to; None: nothing.
 
     Raises:
         OutgrownError: at the start of a frame, there is no memory for the window that it needs.
@@ -86,6 +88,7 @@ class SmokeSolver:
         moving: bool = False,
         forces: ForceField | None = None,
         frame_s: float = 1.0 / 24.0,
+        guide: Guide | None = None,
     ) -> None:
         """Take a smoke, which may have the domain for its box, static solids, and room for obstacles that move.
 
@@ -96,6 +99,7 @@ class SmokeSolver:
         self.sources = sources_of(parameters)
         self.air_forces: list[AirForce] = []
         self.refusal: Callable[[float], str | None] | None = None
+        self.guide: Guide | None = None  # none yet: what follows begins no frame of it
         self._gravity, self._has_gravity = gravity, any(upward(gravity))
         self._lift = parameters.lift_per_kelvin(gravity)
         self._domain, self._solids, self._outer = domain, solids, (forces or ForceField(())).on([(self.name,)])
@@ -116,6 +120,7 @@ class SmokeSolver:
             self._projections.append(self._projection.project())
             self._extrapolation.fill()
             self.begin_frame(0.0)
+        self.guide = guide
 
     def _compute_in_grid(self) -> None:
         """Have room for air at rest in the grid, and all that changes it."""
@@ -216,6 +221,8 @@ class SmokeSolver:
             if source.parameters.emits_during(self.time_s, self.time_s + without_sources):
                 speed = max(speed, source.speed)
                 acceleration = max(acceleration, self._buoyancy_bound(source.target_excess, source.target_density))
+        if self.guide is not None:
+            speed = max(speed, self.guide.largest_speed())
         limits = [self.obstacles.stable_dt(), *(force.stable_dt() for force in self.air_forces)]
         return min(time_of_travel(distance, speed, acceleration + gusts), *limits)
 
@@ -250,6 +257,8 @@ class SmokeSolver:
             fuel = None if self._combustion is None else self._combustion.fuel
             given = self.grid.window, self._outside.velocity, emitting, self._rows
             self._move_window(self._fitting.next(self.air, fuel, *given))
+        if self.guide is not None:
+            self.guide.begin_frame(time_s, self.refusal)
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Density, temperature and velocity at cell centres; solid cells hold no smoke."""
@@ -288,7 +297,8 @@ class SmokeSolver:
         burnt = {} if self._combustion is None else {"burnt": np.array([self._burnt_fuel, self._expanded])}
         window = {"window": np.array([self.grid.first, self.grid.cells])} if self._fitting.follows else {}
         outside = {"outside": np.array(self._outside.velocity)} if self._outer.blows else {}
-        return {**arrays, **self.obstacles.checkpoint(), **window, **outside, **burnt, "clock": clock}
+        guide = {} if self.guide is None else self.guide.checkpoint()
+        return {**arrays, **self.obstacles.checkpoint(), **window, **outside, **burnt, **guide, "clock": clock}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -319,6 +329,8 @@ class SmokeSolver:
             self._outside.velocity = x, y, z
         if self._combustion is not None:
             self._burnt_fuel, self._expanded = arrays["burnt"].tolist()
+        if self.guide is not None:
+            self.guide.restore(arrays, self.time_s)
 
     def diagnostics(self) -> Diagnostics:
         """Totals of the state, and the projections of the frame.
@@ -327,7 +339,8 @@ class SmokeSolver:
         over the frame, `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame. Where
         obstacles may move there is also `compression` [1/s], the worst of the frame (`ProjectionReport`). Where fuel
         burns its soot counts as emitted, and there are the integrals of the fuel, of what has burnt so far, and the
-        volume by which gas has expanded [m³].
+        volume by which gas has expanded [m³]. With a guide `not_converged` counts its solves too, and there is
+        `guide_correlation`, of its velocity and this one [-].
         """
         speed, _ = self._find_speed_and_acceleration()
         volume = self.obstacles.open_volume().astype(np.float64)
@@ -340,16 +353,24 @@ class SmokeSolver:
             "iterations": float(sum(report.iterations for report in self._projections)),
             "residual": max((report.residual for report in self._projections), default=0.0),
             "divergence": max((report.divergence for report in self._projections), default=0.0),
-            "not_converged": float(sum(not report.converged for report in self._projections)),
+            "not_converged": float(self.unfinished_solves),
         }
         if self._combustion is not None:
             numbers["fuel"] = float((self._cells("fuel") * volume).sum()) * self.grid.cell_size**3
             numbers |= {"burnt_fuel": self._burnt_fuel, "expanded": self._expanded}
         if self._fitting.follows:
             numbers["cells"] = float(np.prod(self.grid.cells))
+        if self.guide is not None:
+            numbers["guide_correlation"] = self.guide.correlation(self.air, self.grid)
+            numbers["not_converged"] += self.guide.unfinished_solves()
         if self.obstacles.moving:
             numbers["compression"] = max((report.compression for report in self._projections), default=0.0)
         return numbers
+
+    @property
+    def unfinished_solves(self) -> int:
+        """Projections of the frame that have hit their limit."""
+        return sum(not report.converged for report in self._projections)
 
     def remedies(self) -> Remedies:
         """Smaller steps; larger cells, or slower air, cross less in one."""
@@ -373,6 +394,8 @@ class SmokeSolver:
             self._turbulence.accelerate(self.air, self.time_s + 0.5 * dt, dt)
         for force in self.air_forces:
             force.accelerate(dt)
+        if self.guide is not None:
+            self.guide.draw(self.air, self.grid, self.time_s + dt, dt)
         self._outside.advance(dt)
 
     def _emit(self, dt: float) -> None:

@@ -19,11 +19,12 @@ from pipeline.kinds.checks.smoke_bodies import (
     static_bodies,
 )
 from pipeline.kinds.sizes import expected_cells
+from pipeline.kinds.work import guide_share
 from pipeline.model.amounts import count, gigabytes, rounded_down, rounded_up
 from pipeline.model.boxes import ALL, Box, overlap, smoke_box, span, touch
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings, format_path, unknown_name
+from pipeline.model.problems import Findings, Problem, format_path, unknown_name
 from sim.core.motion.paths import path_through
 from sim.rigid.paths import path_of
 from sim.shapes.placement import PlacedSolid
@@ -65,6 +66,8 @@ def check_smokes(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
         if smoke.grid != "box":
             _check_first_window(job, index, solids, budget, findings)
         standing = _check_in_cells(job, index, solids, geometry_of, findings)
+        if smoke.upres > 1:
+            _check_guide(job, index, solids, geometry_of, findings)
         check_mesh_grids(job, smoke, solids, geometry_of, findings)
         _check_air(job, smoke, index, standing, findings)
         check_closed_domain(job, smoke, solids, findings)
@@ -79,20 +82,21 @@ def check_smokes(job: Job, solids: Solids, budget: MemoryBudget, findings: Findi
 def coarser_cell_sizes(job: Job, largest_factor: float, solids: Solids) -> list[float]:
     """Cell sizes [m] of the smokes, grown by this factor at most, that lose no source and no body.
 
-    Where cells as they are written are wrong already they are kept, so that problems are those of the written job.
+    Where cells as they are written are wrong already they are kept, so that problems are those of the written job. Of
+    a smoke with a guide they are the guide's: what goes where in the film is as there.
     """
     geometry_of = geometry_builder(job, Findings())
 
     def problems(index: int, cell_size: float) -> Findings:
         smoke = job.smoke[index].model_copy(update={"cell_size": cell_size})
-        changed = job.model_copy(update={"smoke": (*job.smoke[:index], smoke, *job.smoke[index + 1 :])})
-        findings = Findings()
-        _check_in_cells(changed, index, solids, geometry_of, findings)
-        return findings
+        return _problems_in_cells(job, index, smoke, solids, geometry_of)
 
     factors = np.linspace(largest_factor, 1.0, COARSER_SIZES, endpoint=False).tolist()
     cell_sizes = []
     for index, smoke in enumerate(job.smoke):
+        if smoke.upres > 1:
+            cell_sizes.append(smoke.guide.cell_size)
+            continue
         low, high = smoke_box(smoke, job.domain)
         cell_sizes.append(smoke.cell_size)
         for cell_size in (smoke.cell_size * factor for factor in factors):
@@ -103,6 +107,50 @@ def coarser_cell_sizes(job: Job, largest_factor: float, solids: Solids) -> list[
                 cell_sizes[index] = cell_size
                 break
     return cell_sizes
+
+
+def _problems_in_cells(
+    job: Job, index: int, smoke: SmokeParameters, solids: Solids, geometry_of: GeometryBuilder
+) -> Findings:
+    """Bodies and sources that the cells of another smoke in the place of one cannot show."""
+    changed = job.model_copy(update={"smoke": (*job.smoke[:index], smoke, *job.smoke[index + 1 :])})
+    findings = Findings()
+    _check_in_cells(changed, index, solids, geometry_of, findings)
+    return findings
+
+
+def _check_guide(job: Job, index: int, solids: Solids, geometry_of: GeometryBuilder, findings: Findings) -> None:
+    """Note what the cells of a guide cannot show, or what it costs."""
+    smoke, guide, path = job.smoke[index], job.smoke[index].guide, ("smoke", index, "upres")
+    low, high = smoke_box(smoke, job.domain)
+    if (high - low).min() < LEAST_LAYERS * guide.cell_size:
+        findings.error(
+            path,
+            f"{smoke.upres} leaves the guide fewer than {LEAST_LAYERS:g} cells of {guide.cell_size:g} m along an edge "
+            f"of {(high - low).min():.3g} m; use less, or smaller cells",
+        )
+        return
+    own = _problems_in_cells(job, index, smoke, solids, geometry_of)
+    found = _problems_in_cells(job, index, guide, solids, geometry_of)
+    for note, of_guide, of_smoke in (
+        (findings.error, found.errors, own.errors),
+        (findings.warn, found.warnings, own.warnings),
+    ):
+        known = {problem.path for problem in of_smoke}
+        for problem in of_guide:
+            if problem.path not in known:
+                note(
+                    path,
+                    f"in the guide's cells of {guide.cell_size:g} m: {format_path(problem.path)} {problem.message}",
+                )
+    cells = count(expected_cells(guide, job.domain))
+    findings.facts.append(
+        Problem(
+            path,
+            f"{smoke.upres}: a simulation of {cells} cells of {guide.cell_size:g} m guides it, for "
+            f"{100.0 * guide_share(smoke):.2g} % more time; --preview draws that one",
+        )
+    )
 
 
 def _check_in_cells(
@@ -206,8 +254,10 @@ def growth_refusal(job: Job) -> Callable[[float], str | None]:
 
 
 def _bytes_per_cell(smoke: SmokeParameters, *, on_gpu: bool) -> int:
+    """Of its own cells, with their share of a guide's."""
     of_all, of_fire = (BYTES_PER_CELL_ON_GPU, FIRE_BYTES_ON_GPU) if on_gpu else (BYTES_PER_CELL, FIRE_BYTES)
-    return of_all if smoke.fire is None else of_all + of_fire
+    each = of_all if smoke.fire is None else of_all + of_fire
+    return each if smoke.upres == 1 else each + math.ceil(each / smoke.upres**3)
 
 
 def _cell_size_that_fits(extent: NDArray[np.float64], smoke: SmokeParameters, room: float, *, on_gpu: bool) -> float:

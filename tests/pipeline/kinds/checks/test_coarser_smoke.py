@@ -93,3 +93,15 @@ def test_what_the_written_cells_are_wrong_for_is_told_with_one_line(text, told, 
         load_checked_job(path, preview=True)
     (problem,) = error.value.problems
     assert problem.startswith(told)
+
+
+def test_a_preview_of_a_guided_smoke_is_its_guide(tmp_path):
+    # Its cells are those of the guide even where half of the film's would do.
+    guided = PLUME.replace(
+        "cell_size = 0.02", "cell_size = 0.02\nupres = 3\nturbulence = { strength = 1.0, size = 0.1 }"
+    )
+    path = tmp_path / "job.toml"
+    path.write_text(guided)
+    written = load_checked_job(path)[0].job.smoke[0]
+    assert load_checked_job(path, preview=True)[0].job.smoke[0] == written.guide
+    assert (written.guide.cell_size, written.guide.turbulence.size) == pytest.approx((0.06, 0.12))

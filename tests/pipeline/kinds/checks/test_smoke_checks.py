@@ -67,6 +67,11 @@ def burning(fire: str, source: str = "fuel = 1.0") -> str:
             with_keys('wind = [2.0, 0.0, 0.0]\nopen_faces = ["x-", "x+"]') + WALL,
             "7 smoke[0].wind: ... x-, but solids that stand still cut air there off ... leave a way around them",
         ),
+        (
+            with_keys("upres = 4").replace("radius = 0.1", "radius = 0.05"),
+            "7 smoke[0].upres: in ... cells of 0.2 m: smoke[0].source[0] holds no",
+        ),
+        (with_keys("upres = 4\nmax = [0.5, 0.5, 0.5]"), "7 smoke[0].upres: 4 leaves the guide fewer than"),
         (with_keys("turbulence = { strength = 1.0, size = 0.06 }"), "7 smoke[0].turbulence.size: 0.06 m ... use 0.1 m"),
         (FIRE + "temperature = 2e4\n", "11 smoke[0].source[0].temperature: 20000 K is beyond 10000 K"),
     ],
@@ -235,3 +240,23 @@ def test_a_preview_has_gusts_that_its_cells_can_carry(size, expected, tmp_path):
     path.write_text(HEAD + SMOKE + f"turbulence = {{ strength = 1.0, size = {size} }}\n" + SOURCE)
     assert load_checked_job(path)[1].errors == load_checked_job(path, preview=True)[1].errors == []
     assert read_job(path, preview=True).job.smoke[0].turbulence.size == pytest.approx(expected)
+
+
+def test_what_a_guide_costs_is_told(tmp_path):
+    findings = checked(with_keys("upres = 2"), tmp_path / "fire.toml").findings
+    (fact,) = (fact for fact in findings.facts if fact.path == ("smoke", 0, "upres"))
+    assert fact.message == (
+        "2: a simulation of 1000 cells of 0.1 m guides it, for 16 % more time; --preview draws that one"
+    )
+    assert not findings.errors and not findings.warnings
+
+
+def test_a_guide_takes_memory_as_well(tmp_path):
+    def needed(upres: int) -> float:
+        path, findings = tmp_path / f"{upres}.toml", Findings()
+        path.write_text(with_keys(f"upres = {upres}"))
+        check_smokes(read_job(path).job, {}, MemoryBudget(1_000_000, "this machine", on_gpu=False), findings)
+        (error,) = (problem.message for problem in findings.errors if "need" in problem.message)
+        return float(re.search(r"need ([\d.]+) GB", error).group(1))
+
+    assert needed(2) == pytest.approx(1.125 * needed(1), rel=0.01)
