@@ -85,11 +85,12 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_soft_matter_among_bodies(self) -> Self:
-        """Soft matter has no coupling with cloth, and would pass through it."""
-        if self.soft and self.cloth:
+        """Fluid has room for one kind of sheets: samples of soft matter, or of cloth."""
+        if self.soft and self.cloth and self.fluid:
             raise KeyRefusedError(
                 ("soft", 0),
-                "meets walls, rigid bodies, fluids and smoke, and would pass through cloth; remove one of both",
+                "meets cloth, and meets fluid, but not both in one job: fluid would not feel the cloth; remove one of "
+                "the three",
             )
         bodies = {name for body in self.rigid for name in (body.name, body.group)}
         for number, soft in enumerate(self.soft):

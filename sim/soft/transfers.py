@@ -64,6 +64,15 @@ class Load(NamedTuple):
 
 
 @bundle
+class Parting(NamedTuple):
+    """Nodes that sheets part particles from, (n,) each: they take nothing of the particle."""
+
+    hidden: Integers  # a bit for each of the 27 nodes, x first
+    ghost: Vectors  # velocity that the particle takes from them [m/s]
+    there: ti.template()  # whether there is any sheet; no node is hidden otherwise
+
+
+@bundle
 class Shares(NamedTuple):
     """What the particles of each cell give each of their 27 nodes, (k * 64 * 27,); of no meaning in empty cells."""
 
@@ -102,6 +111,12 @@ def weight_at(away: ti.math.vec3) -> ti.f32:
     return spline(away[0]) * spline(away[1]) * spline(away[2])
 
 
+@ti.func
+def is_hidden(hidden: ti.i32, lane: ti.i32) -> ti.i32:
+    """Whether a node of a particle is behind a sheet."""
+    return hidden >> lane & 1
+
+
 @func
 def give(
     cell: ti.i32,
@@ -111,6 +126,7 @@ def give(
     particles: Particles,
     masses: Floats,
     load: Load,
+    parting: Parting,
     shares: Shares,
 ):
     """What the particles of a cell, with this lowest node, give to one of their nodes, their loads included."""
@@ -121,6 +137,8 @@ def give(
         p = blocks.sort.order[s]
         away = at - place_of(particles.position[p], blocks)
         weight = weight_at(away)
+        if ti.static(parting.there):
+            weight *= 1.0 - is_hidden(parting.hidden[p], lane)
         own = masses[particles.body[p]]
         carried = own * particles.velocity[p] + particles.affine[p] @ away
         if ti.static(load.there):
@@ -141,6 +159,7 @@ def particles_to_grid(
     masses: Floats,
     volume: ti.f32,
     load: Load,
+    parting: Parting,
     shares: Shares,
     nodes: Nodes,
     gravity: ti.math.vec3,
@@ -163,13 +182,13 @@ def particles_to_grid(
         for i in range(stored * (NODES * WARP)):
             cell = i // WARP
             if i % WARP < SHARES and blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
-                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, masses, load, shares)
+                give(cell, node_of(cell, blocks), i % WARP, blocks, particles, masses, load, parting, shares)
     else:
         for cell in range(stored * NODES):
             if blocks.sort.cell_start[cell] < blocks.sort.cell_start[cell + 1]:
                 corner = node_of(cell, blocks)
                 for lane in range(SHARES):
-                    give(cell, corner, lane, blocks, particles, masses, load, shares)
+                    give(cell, corner, lane, blocks, particles, masses, load, parting, shares)
     for n in range(stored * NODES):
         inside = Triple(n % EDGE, n // EDGE % EDGE, n % NODES // (EDGE * EDGE))
         mass = 0.0
@@ -191,6 +210,7 @@ def grid_to_particles(
     particles: Particles,
     laws: Laws,
     nodes: Nodes,
+    parting: Parting,
     box: Box,
     dt: ti.f32,
 ):
@@ -209,7 +229,11 @@ def grid_to_particles(
                 for dx in ti.static(range(SUPPORT)):
                     step = Triple(dx, dy, dz)
                     away = ti.cast(base + step, ti.f32) - place
-                    v_i = weight_at(away) * nodes.velocity[node_ahead(block, inside + step, blocks)]
+                    v_i = nodes.velocity[node_ahead(block, inside + step, blocks)]
+                    if ti.static(parting.there):
+                        if is_hidden(parting.hidden[p], (dz * SUPPORT + dy) * SUPPORT + dx):
+                            v_i = parting.ghost[p]
+                    v_i *= weight_at(away)
                     velocity += v_i
                     affine += v_i.outer_product(away)
         affine *= APIC / h
