@@ -1,9 +1,9 @@
 """Two-way coupling of soft matter and cloths, whose sheets part the grid: CPIC (Hu et al. 2018) with exact sums.
 
 A particle near a sheet has no share in the nodes on the other side of the sheet's tangent plane at the point nearest to
-it. What it would have given them, stresses included, meets the sheet instead: it collides without bounce, with friction,
-and goes with the sheet for the step. With M and P the mass and momentum of that part of a particle, v the sheet's
-velocity there and n its normal towards the particle,
+it. What it would have given them, stresses included, meets the sheet instead: it collides without bounce, with
+friction, and goes with the sheet for the step. With M and P the mass and momentum of that part of a particle, v the
+sheet's velocity there and n its normal towards the particle,
 
     w = slid(P/M - v),   J = M (P/M + dt g - v - w)
 
@@ -295,7 +295,9 @@ def meet(
     for p in range(particles.count):
         if parting.hidden[p] != 0:
             own = masses[particles.body[p]]
-            to_corner = ti.cast(base_of(particles.position[p], blocks), ti.f32) - place_of(particles.position[p], blocks)
+            to_corner = ti.cast(base_of(particles.position[p], blocks), ti.f32) - place_of(
+                particles.position[p], blocks
+            )
             share = 0.0
             arm = ti.math.vec3(0.0)
             for lane in range(SHARES):

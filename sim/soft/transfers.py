@@ -231,8 +231,8 @@ def grid_to_particles(
                     away = ti.cast(base + step, ti.f32) - place
                     v_i = nodes.velocity[node_ahead(block, inside + step, blocks)]
                     if ti.static(parting.there):
-                        if is_hidden(parting.hidden[p], (dz * SUPPORT + dy) * SUPPORT + dx):
-                            v_i = parting.ghost[p]
+                        lane = ti.static((dz * SUPPORT + dy) * SUPPORT + dx)
+                        v_i = ti.select(is_hidden(parting.hidden[p], lane), parting.ghost[p], v_i)
                     v_i *= weight_at(away)
                     velocity += v_i
                     affine += v_i.outer_product(away)
