@@ -11,6 +11,7 @@ from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.live_parameters import SOFT_LIVE
 from pipeline.kinds.sizes import box_of, measures_of
 from pipeline.kinds.work import soft_work
 from pipeline.model.job import Job
@@ -152,6 +153,7 @@ SOFT = Kind(
     reach=_reach,
     reach_bytes=160.0,
     display=Display("Soft matter", "points"),
+    live=SOFT_LIVE,
     facts=lambda soft, count: (
         f"{soft.material.replace('_', ' ')}, cells of {soft.cell_size:g} m"
         + ("" if count is None else f", {count:,.0f} particles")

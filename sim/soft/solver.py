@@ -25,7 +25,7 @@ from sim.soft.blocks import NODES, BlockGrid, Blocks
 from sim.soft.contact import BodyContacts, stop_at_walls
 from sim.soft.laws import Laws
 from sim.soft.materials import Law
-from sim.soft.parameters import SoftParameters, shared_conflicts
+from sim.soft.parameters import LIVE_KEYS, SoftParameters, shared_conflicts
 from sim.soft.pouring import Poured, Pouring, has_come, waiting_rows
 from sim.soft.transfers import (
     COUNTS,
@@ -159,6 +159,19 @@ class SoftSolver:
         results = measure(self.particles, self._laws, self._reduction.over(self.particles.count))
         squared_speed, self._hardened, self._bad = self._reduction.unpack(results).tolist()
         self._speed = math.sqrt(squared_speed)
+
+    def change(self, name: str, **changes: object) -> None:
+        """Change what a body is made of between frames, by the keys of a job.
+
+        Raises:
+            ValueError: a key that cannot change, or a value that it cannot have; nothing has changed then.
+        """
+        if fixed := set(changes) - set(LIVE_KEYS):
+            raise ValueError(f"{min(fixed)} of soft matter cannot change while it is simulated; build it anew")
+        number = [each.name for each in self.parameters].index(name)
+        changed = SoftParameters.model_validate({**self.parameters[number].model_dump(exclude_unset=True), **changes})
+        self.parameters = (*self.parameters[:number], changed, *self.parameters[number + 1 :])
+        self._laws = laws_of(self.parameters)
 
     # --- the step ---------------------------------------------------------------------------------------------------
 
