@@ -42,6 +42,7 @@ LEAST_GAP = 0.02  # of a particle and a sheet [cells]
 CROSSED = 1.0e-3  # distance from a triangle below which a way has crossed it [cells]
 STEEPEST = 0.7  # cosine of the angle to a rim's normal within which a particle is over the sheet
 MOST_ROUNDS = 4  # of putting particles back in a step
+LOOSE = 1.0 + 1.0e-4  # factor on a distance that must not be too small by rounding
 TERMS = 4  # of a node's sums: mass and impulse
 FRACTIONS = 2.0**30  # steps of what keys compare, in a range of 1
 
@@ -72,6 +73,7 @@ class Met(NamedTuple):
     key: LongIntegers  # of what is to be done first: a number from 0 to 1, and its triangle
     start: Vectors  # where they are at the start of a step [m]
     triangle: Integers  # the nearest one, -1 if none is near
+    bound: Floats  # distance beyond which there is none that is nearest [m]
     weights: Vectors  # barycentric coordinates of the nearest point on it
     normal: Vectors  # from there to the particle
     touches: Integers  # whether it goes with the sheet
@@ -90,7 +92,8 @@ class SoftClothCoupling(Coupling):
         state, count = cloth.state, soft.particles.count
         vectors = [ti.Vector.ndarray(3, ti.f32, count) for _ in range(3)]
         integers = [ti.ndarray(ti.i32, count) for _ in range(2)]
-        self._met = Met(ti.ndarray(ti.i64, count), vectors[0], integers[0], vectors[1], vectors[2], integers[1])
+        key, bound = ti.ndarray(ti.i64, count), ti.ndarray(ti.f32, count)
+        self._met = Met(key, vectors[0], integers[0], bound, vectors[1], vectors[2], integers[1])
         own = soft.parameters[0].friction
         friction = state.host.of_triangles([math.sqrt(own * each.friction) for each in cloth.parameters])
         self._sheets = Sheets(
@@ -217,14 +220,23 @@ def cell_at(node: Triple, blocks: Blocks) -> ti.i32:
 
 @kernel
 def find_nearest(blocks: Blocks, particles: Particles, sheets: Sheets, met: Met, reach: ti.f32):
-    """The triangle nearest to each particle within a reach [m], as a key; the lowest number of several."""
+    """The triangle nearest to each particle within a reach [m], as a key; the lowest number of several.
+
+    Those whose box is farther off than the one that was nearest in the step before are left out. What is found does not
+    depend on which that was.
+    """
     for p in range(particles.count):
+        x_p = particles.position[p]
         met.key[p] = no_key()
-        met.start[p] = particles.position[p]
+        met.start[p] = x_p
+        n = sheets.corners[ti.max(met.triangle[p], 0)]
+        a, b, c = sheets.before[n[0]], sheets.before[n[1]], sheets.before[n[2]]
+        known = distance_to_triangle(ti.math.vec3(0.0), a - x_p, b - x_p, c - x_p)
+        met.bound[p] = ti.min(reach, LOOSE * known + (LOOSE - 1.0) * reach)
     for t in range(sheets.count):
         n = sheets.corners[t]
         a, b, c = sheets.before[n[0]], sheets.before[n[1]], sheets.before[n[2]]
-        normal = normal_at(t, sheets, sheets.before)
+        lower, upper = ti.min(a, ti.min(b, c)), ti.max(a, ti.max(b, c))
         low, high = (
             cells_around(t, sheets, reach, blocks, True),
             cells_around(t, sheets, reach, blocks, False),
@@ -237,7 +249,8 @@ def find_nearest(blocks: Blocks, particles: Particles, sheets: Sheets, met: Met,
                         for s in range(blocks.sort.cell_start[cell], blocks.sort.cell_start[cell + 1]):
                             p = blocks.sort.order[s]
                             x_p = particles.position[p]
-                            if ti.abs((x_p - a).dot(normal)) < reach:
+                            off_box = ti.max(0.0, ti.max(lower - x_p, x_p - upper)).norm()
+                            if off_box < met.bound[p]:
                                 distance = distance_to_triangle(ti.math.vec3(0.0), a - x_p, b - x_p, c - x_p)
                                 if distance < reach:
                                     ti.atomic_min(met.key[p], key_of(distance / reach, t))
