@@ -23,6 +23,7 @@ from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
+from sim.coupling.soft_cloth import SoftClothCoupling
 from sim.coupling.soft_emitters import poured_by
 from sim.coupling.soft_fluid import SoftFluidCoupling, samples_of_soft
 from sim.coupling.soft_rigid import SoftRigidCoupling, contacts_of_soft
@@ -96,8 +97,9 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     around = static, rigid, samples, next(iter(softs), None)
     fluids = [_build_fluids(scene, *around, forces)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, static, forces, frames_per_second) for smoke in scene.smoke]
-    coupled: list[Solver] = [*fluids, *cloths, *softs, *([] if rigid is None else [rigid]), *smokes]
-    couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
+    coupled: list[Solver] = [*fluids, *softs, *cloths, *([] if rigid is None else [rigid]), *smokes]
+    couplings: list[Coupling] = [SoftClothCoupling(soft, cloth) for soft in softs for cloth in cloths]
+    couplings += [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
         names = [body.name for kind in (True, False) for body in scene.rigid if (body.kind != "static") == kind]
         passing = passing_of(scene.joint, scene.cloth, names)

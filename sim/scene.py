@@ -11,7 +11,7 @@ from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
 from sim.embers.parameters import EmberParameters
 from sim.fluid.parameters import FluidParameters, dye_conflict
-from sim.forces.parameters import MOST_FORCES, Force, unknown_targets
+from sim.forces.parameters import MOST_FORCES, AirForce, Force, unknown_targets
 from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.parameters import RigidBodyParameters
@@ -39,7 +39,7 @@ class SceneParameters(Parameters):
     )
     soft: tuple[SoftParameters, ...] = Field(
         default=(),
-        description="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies, fluids and smoke.",
+        description="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies, fluids, cloth and smoke.",
     )
     embers: tuple[EmberParameters, ...] = Field(default=(), description="Embers that the air of a smoke carries.")
     force: Annotated[tuple[Force, ...], Field(max_length=MOST_FORCES)] = Field(
@@ -84,13 +84,35 @@ class SceneParameters(Parameters):
         return self
 
     @model_validator(mode="after")
-    def _has_soft_matter_among_bodies(self) -> Self:
-        """Soft matter has no coupling with cloth, and would pass through it."""
-        if self.soft and self.cloth:
+    def _has_soft_matter_beside_cloth(self) -> Self:
+        """Fluid has room for one kind of sheets, samples of soft matter or of cloth; and what goes along with cloth
+        has felt forces already."""
+        if self.soft and self.cloth and self.fluid:
             raise KeyRefusedError(
                 ("soft", 0),
-                "meets walls, rigid bodies, fluids and smoke, and would pass through cloth; remove one of both",
+                "meets cloth, and meets fluid, but not both in one job: fluid would not feel the cloth; remove one of "
+                "the three",
             )
+        for number, cloth in enumerate(self.cloth):
+            if self.soft and cloth.integrator == "explicit":
+                raise KeyRefusedError(
+                    ("cloth", number, "integrator"),
+                    '"explicit" takes thousands of substeps a frame, which soft matter would have to share; '
+                    'use "xpbd", or remove the soft matter',
+                )
+        cloths = {cloth.name for cloth in self.cloth}
+        for number, force in enumerate(self.force):
+            is_felt = not isinstance(force, AirForce) and (not force.only or bool(cloths & {*force.only}))
+            if self.soft and cloths and is_felt:
+                raise KeyRefusedError(
+                    ("force", number, "only"),
+                    f'"{force.type}" acts on cloth in a job with soft matter, which would feel it twice where it '
+                    "touches; name only other bodies, or change the job's own gravity",
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _has_bodies_that_soft_matter_sticks_to(self) -> Self:
         bodies = {name for body in self.rigid for name in (body.name, body.group)}
         for number, soft in enumerate(self.soft):
             for entry, name in enumerate(soft.sticks_to):

@@ -31,7 +31,7 @@ from pipeline.queue.submitting import submit as submit_to_queue
 if TYPE_CHECKING:
     from pipeline.run.plan import Assessment
 
-TEMPLATES = ("dam-break", "drop", "smoke", "cloth")
+TEMPLATES = ("dam-break", "drop", "smoke", "cloth", "sand")
 """As in `pipeline.job.starter`, which is too heavy to be imported for `--help`."""
 
 

@@ -126,7 +126,7 @@ def live(
     if not as_written and substeps is None:
         job = fluent(job, power=computing_power(cores=threads, on_gpu=on_gpu))
     if not anyway:
-        require_small(job, findings.elements["fluid"], cores=threads, on_gpu=on_gpu)
+        require_small(job, findings.elements["fluid"], findings.elements["soft"], cores=threads, on_gpu=on_gpu)
     print_warnings(loaded.warnings)
     if told := told_changes(loaded.job, {parameter.name: parameter.start for parameter in parameters_of(job)}):
         click.echo(told)

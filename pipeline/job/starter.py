@@ -7,7 +7,7 @@ from string import Template
 from pipeline.base.errors import JobFileError
 from pipeline.model.job import NAME_PATTERN
 
-TEMPLATES = ("dam-break", "drop", "smoke", "cloth")
+TEMPLATES = ("dam-break", "drop", "smoke", "cloth", "sand")
 _FOLDER = Path(__file__).with_name("templates")
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from sim.cloth.parameters import substeps_of
+from sim.soft.materials import LAW_KEYS
 
 Value = float | bool | tuple[float, float, float]
 Widget = Literal["number", "decades", "whole", "switch", "vector"]
@@ -205,4 +206,32 @@ FLUID_LIVE = LiveParameters(
     solver=lambda job: "+".join(fluid.name for fluid in job.fluid),
     set=_set_fluid,
     set_gravity=None,  # a fluid is sized for gravity when it is built
+)
+
+
+# --- soft matter ---
+
+MODULUS: Row = ("young_modulus", "Young's modulus [Pa]", "decades", 1.0e3, 1.0e6)
+SOFT_ROWS: tuple[Row, ...] = (
+    ("friction_angle_deg", "angle of friction [degrees]", "number", 1.0, 60.0),
+    ("cohesion", "cohesion [Pa]", "number", 0.0, 2.0e3),
+    ("yield_stress", "yield stress [Pa]", "decades", 10.0, 1.0e5),
+    ("viscosity", "viscosity [Pa s]", "number", 0.0, 100.0),
+    ("hardening", "hardening", "number", 0.0, 20.0),
+)
+
+
+def _of_soft(job: Job, _written: Job) -> Iterator[Parameter]:
+    """What each body is made of, as far as its law knows it."""
+    for number, body in enumerate(job.soft):
+        rows = [MODULUS, *(row for row in SOFT_ROWS if LAW_KEYS[row[0]] == body.row.law)]
+        made_of = body.model_copy(update={key: body.value(key) for key, *_ in rows})
+        yield from _of_body("soft", "Soft matter", number, made_of, rows)
+
+
+SOFT_LIVE = LiveParameters(
+    of=_of_soft,
+    solver=lambda _job: "soft",
+    set=lambda solver, body, key, value, _before: solver.change(body, **{key: value}),
+    set_gravity=lambda solver, value: setattr(solver, "gravity", value),
 )

@@ -11,6 +11,7 @@ from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids, Work
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.live_parameters import SOFT_LIVE
 from pipeline.kinds.sizes import box_of, measures_of
 from pipeline.kinds.work import soft_work
 from pipeline.model.job import Job
@@ -130,7 +131,7 @@ MATTER = Product(
 SOFT = Kind(
     name="soft",
     parameters=SoftParameters,
-    about="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies, fluids and smoke.",
+    about="Sand, snow, jelly and clay, on one grid; they meet walls, rigid bodies, fluids, cloth and smoke.",
     size="about {:,} particles of soft matter",
     elements=lambda _job, soft: count_particles(soft),
     snapshot_bytes=(150.0, 24.0, 140.0),
@@ -152,6 +153,7 @@ SOFT = Kind(
     reach=_reach,
     reach_bytes=160.0,
     display=Display("Soft matter", "points"),
+    live=SOFT_LIVE,
     facts=lambda soft, count: (
         f"{soft.material.replace('_', ' ')}, cells of {soft.cell_size:g} m"
         + ("" if count is None else f", {count:,.0f} particles")

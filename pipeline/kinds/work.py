@@ -157,9 +157,15 @@ def _fall_speed(job: Job) -> float:
     return expected_speed(np.concatenate(points), np.concatenate(velocities), job.domain, job.gravity)
 
 
-def frame_s(job: Job, particles: int, *, power: float) -> float:
+def soft_frame_s(job: Job, particles: int, *, power: float) -> float:
+    """Time that a frame of soft matter takes [s], of this many particles."""
+    return shared_steps(job) * (particles * SOFT_PARTICLE_STEP_S / power + SOFT_STEP_S) if job.soft else 0.0
+
+
+def frame_s(job: Job, particles: int, soft_particles: int, *, power: float) -> float:
     """Time that a frame of a scene takes [s]; rigid bodies cost next to nothing. Raises ShapeError as above."""
-    return cloth_frame_s(job, power=power) + fluid_frame_s(job, particles, power=power)
+    of_particles = fluid_frame_s(job, particles, power=power) + soft_frame_s(job, soft_particles, power=power)
+    return cloth_frame_s(job, power=power) + of_particles
 
 
 # --- work, of which films are estimated ---

@@ -153,6 +153,10 @@ def coarse_for_fluid(soft: SoftParameters, spacing: float) -> str | None:
     )
 
 
+LIVE_KEYS = ("young_modulus", "friction_angle_deg", "cohesion", "yield_stress", "viscosity", "hardening")
+"""Keys that can change while it is simulated, where its material has them."""
+
+
 SHARED_KEYS = ("cell_size", "friction", "sticks_to", "cfl")
 """Keys that all soft bodies of a job share, as they share a grid and its steps."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,11 +21,11 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.forces.field import ForceField
 from sim.shapes.filled_volume import Surroundings, pack
 from sim.shapes.placement import build_solid
-from sim.soft.blocks import NODES, BlockGrid, sorted_by_cell
+from sim.soft.blocks import NODES, BlockGrid, Blocks, sorted_by_cell
 from sim.soft.contact import BodyContacts, stop_at_walls
 from sim.soft.laws import Laws
 from sim.soft.materials import Law
-from sim.soft.parameters import SoftParameters, shared_conflicts
+from sim.soft.parameters import LIVE_KEYS, SoftParameters, shared_conflicts
 from sim.soft.pouring import Poured, Pouring, has_come, waiting_rows
 from sim.soft.transfers import (
     COUNTS,
@@ -36,6 +36,7 @@ from sim.soft.transfers import (
     Load,
     Nodes,
     Particles,
+    Parting,
     grid_to_particles,
     measure,
     particles_to_grid,
@@ -72,6 +73,8 @@ class SoftSolver:
         contacts: rigid bodies that soft matter meets; None where there are none.
         particles: for kernels.
         load: what touches the particles in the next step; none before `let_touch`.
+        parting: the nodes that sheets hide from the particles; none before `let_part`.
+        met_speed: of the fastest sheet [m/s].
         masses: of a particle of each body [kg], (bodies,), on the device.
         spacing, volume: of particles at rest [m, m³].
         poured: what emitters let in.
@@ -112,6 +115,9 @@ class SoftSolver:
         self.spacing = self.parameters[0].spacing
         self.masses, self.volume = on_device(particle_mass), volume
         self._load_particles(0)
+        self._find_hidden: Callable[[Blocks, int], None] | None = None
+        self._part_particles(0)
+        self.met_speed = 0.0
         self._laws = laws_of(self.parameters)
         self._grid = BlockGrid(domain, self.parameters[0].cell_size, n)
         self._make_nodes()
@@ -130,6 +136,22 @@ class SoftSolver:
         arrays = ti.ndarray(ti.f32, max(count, 1)), ti.Vector.ndarray(3, ti.f32, max(count, 1))
         self.load = Load(*arrays, there=count > 0)
 
+    def let_part(self, find_hidden: Callable[[Blocks, int], None]) -> None:
+        """Have `find_hidden` find what sheets part in each substep, once particles are sorted into so many blocks.
+
+        Whoever couples the sheets ends each substep by `end_substep`, when it knows how they move.
+        """
+        self._find_hidden = find_hidden
+        self._part_particles(self.particles.count)
+
+    def _part_particles(self, count: int) -> None:
+        arrays = ti.ndarray(ti.i32, max(count, 1)), ti.Vector.ndarray(3, ti.f32, max(count, 1))
+        self.parting = Parting(*arrays, there=count > 0)
+
+    def placed_by_others(self) -> None:
+        """Whoever couples soft matter has put particles elsewhere."""
+        self._grid.moved(math.inf)
+
     def _make_nodes(self) -> None:
         room = self._grid.blocks.room * NODES
         if PARTS * SHARES * room > MOST_SHARES:
@@ -146,6 +168,19 @@ class SoftSolver:
         squared_speed, self._hardened, self._bad = self._reduction.unpack(results).tolist()
         self._speed = math.sqrt(squared_speed)
 
+    def change(self, name: str, **changes: object) -> None:
+        """Change what a body is made of between frames, by the keys of a job.
+
+        Raises:
+            ValueError: a key that cannot change, or a value that it cannot have; nothing has changed then.
+        """
+        if fixed := set(changes) - set(LIVE_KEYS):
+            raise ValueError(f"{min(fixed)} of soft matter cannot change while it is simulated; build it anew")
+        number = [each.name for each in self.parameters].index(name)
+        changed = SoftParameters.model_validate({**self.parameters[number].model_dump(exclude_unset=True), **changes})
+        self.parameters = (*self.parameters[:number], changed, *self.parameters[number + 1 :])
+        self._laws = laws_of(self.parameters)
+
     # --- the step ---------------------------------------------------------------------------------------------------
 
     def stable_dt(self) -> float:
@@ -156,7 +191,8 @@ class SoftSolver:
             for each in self.parameters
         )
         way = shared.cfl * MOTION_NUMBER * shared.cell_size
-        speed = max(self._speed, 0.0 if self._pouring is None else self._pouring.largest_speed)
+        poured = 0.0 if self._pouring is None else self._pouring.largest_speed
+        speed = max(self._speed, self.met_speed, poured)
         return min(by_waves, way / max(speed, math.sqrt(way * fall), TINY_SPEED))
 
     def substep(self, dt: float) -> None:
@@ -170,12 +206,22 @@ class SoftSolver:
         if grid.sort(particles.position, particles.body):
             self._make_nodes()
         blocks, stored = grid.blocks, grid.count
-        given = self.masses, self.volume, self.load, self._shares, self._nodes, ti.math.vec3(self.gravity)
-        particles_to_grid(blocks, stored, particles, *given, dt)
+        if self._find_hidden is not None:
+            self._find_hidden(blocks, stored)
+        touching = self.masses, self.volume, self.load, self.parting
+        particles_to_grid(
+            blocks, stored, particles, *touching, self._shares, self._nodes, ti.math.vec3(self.gravity), dt
+        )
         if self.contacts is not None:
             self.contacts.resolve(blocks, stored, self._nodes, dt)
         stop_at_walls(blocks, stored, self._nodes, self._box, self.parameters[0].friction)
-        grid_to_particles(blocks, stored, particles, self._laws, self._nodes, self._box, dt)
+        if self._find_hidden is None:
+            self.end_substep(dt)
+
+    def end_substep(self, dt: float) -> None:
+        """Take velocities back from the nodes, and move for dt [s]."""
+        grid, given = self._grid, (self._laws, self._nodes, self.parting, self._box)
+        grid_to_particles(grid.blocks, grid.count, self.particles, *given, dt)
         self._measure()
         grid.moved(dt * self._speed)
 

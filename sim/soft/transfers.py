@@ -68,6 +68,15 @@ class Load(NamedTuple):
 
 
 @bundle
+class Parting(NamedTuple):
+    """Nodes that sheets part particles from, (n,) each: they take nothing of the particle."""
+
+    hidden: Integers  # a bit for each of the 27 nodes, x first
+    ghost: Vectors  # velocity that the particle takes from them [m/s]
+    there: ti.template()  # whether there is any sheet; no node is hidden otherwise
+
+
+@bundle
 class Nodes(NamedTuple):
     """Nodes of stored blocks, (k * 64,) each."""
 
@@ -97,6 +106,12 @@ def symmetric_at(rows: Floats, p: ti.i32, count: ti.i32) -> ti.math.mat3:
     return matrix
 
 
+@ti.func
+def is_hidden(hidden: ti.i32, lane: ti.i32) -> ti.i32:
+    """Whether a node of a particle is behind a sheet."""
+    return hidden >> lane & 1
+
+
 @func
 def keep_symmetric(rows: Floats, p: ti.i32, count: ti.i32, matrix: ti.math.mat3):
     """Put a particle's symmetric matrix into its rows."""
@@ -113,9 +128,30 @@ def spline(distance: ti.f32) -> ti.f32:
 
 
 @ti.func
+def weight_at(away: ti.math.vec3) -> ti.f32:
+    """Share of a particle in a node of its own [-]."""
+    return spline(away[0]) * spline(away[1]) * spline(away[2])
+
+
+@ti.func
 def splines(offset: ti.math.vec3):
     """Shares of the lowest, middle and highest node along each axis, of a particle so far from the lowest [edges]."""
     return 0.5 * (1.5 - offset) ** 2, 0.75 - (offset - 1.0) ** 2, 0.5 * (offset - 0.5) ** 2
+
+
+@func
+def affine_momentum(particles: Particles, p: ti.i32, mass: ti.f32, pull: ti.f32, blocks: Blocks) -> ti.math.mat3:
+    """Momentum of a particle across a cell [kg m/s], with the impulse of its stress, `pull` [m² s] times that."""
+    momentum = -pull * symmetric_at(particles.stress, p, particles.count)
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        momentum[i, j] += blocks.edge * mass * particles.affine[(3 * i + j) * particles.count + p]
+    return momentum
+
+
+@func
+def pull_of(volume: ti.f32, blocks: Blocks, dt: ti.f32) -> ti.f32:
+    """What the stress of a particle with this volume at rest [m³] counts in its momentum across a cell [m² s]."""
+    return dt * volume * APIC / blocks.edge
 
 
 @kernel
@@ -126,6 +162,7 @@ def particles_to_grid(
     masses: Floats,
     volume: ti.f32,
     load: Load,
+    parting: Parting,
     shares: Floats,
     nodes: Nodes,
     gravity: ti.math.vec3,
@@ -138,7 +175,7 @@ def particles_to_grid(
     momenta [kg m/s], with a number for every cell; those of empty cells mean nothing.
     """
     cells = stored * NODES
-    pull = dt * volume * APIC / blocks.edge
+    pull = pull_of(volume, blocks, dt)
     for k in range(SUPPORT * cells):
         cell, dz = k // SUPPORT, k % SUPPORT
         first, end = blocks.sort.cell_start[cell], blocks.sort.cell_start[cell + 1]
@@ -154,12 +191,12 @@ def particles_to_grid(
                 if ti.static(load.there):
                     mass += load.mass[p]
                     momentum += load.momentum[p]
-                affine = -pull * symmetric_at(particles.stress, p, particles.count)
-                for i, j in ti.static(ti.ndrange(3, 3)):
-                    affine[i, j] += blocks.edge * mass * particles.affine[(3 * i + j) * particles.count + p]
+                affine = affine_momentum(particles, p, mass, pull, blocks)
                 momentum -= affine @ away
                 for dy, dx in ti.static(ti.ndrange(SUPPORT, SUPPORT)):
                     weight = weights[dx][0] * weights[dy][1] * across
+                    if ti.static(parting.there):
+                        weight *= 1.0 - is_hidden(parting.hidden[p], (dz * SUPPORT + dy) * SUPPORT + dx)
                     carried = momentum + affine @ ti.math.vec3(dx, dy, 0.0)
                     at = ti.static(PARTS * (dy * SUPPORT + dx))
                     given[at] += weight * mass
@@ -191,6 +228,7 @@ def grid_to_particles(
     particles: Particles,
     laws: Laws,
     nodes: Nodes,
+    parting: Parting,
     box: Box,
     dt: ti.f32,
 ):
@@ -209,7 +247,11 @@ def grid_to_particles(
             for dy, dx in ti.static(ti.ndrange(SUPPORT, SUPPORT)):
                 step = Triple(dx, dy, dz)
                 weight = weights[dx][0] * weights[dy][1] * across
-                v_i = weight * nodes.velocity[node_ahead(block, inside + step, blocks)]
+                v_i = nodes.velocity[node_ahead(block, inside + step, blocks)]
+                if ti.static(parting.there):
+                    is_behind = is_hidden(parting.hidden[p], (dz * SUPPORT + dy) * SUPPORT + dx)
+                    v_i = ti.select(is_behind, parting.ghost[p], v_i)
+                v_i *= weight
                 velocity += v_i
                 affine += v_i.outer_product(ti.cast(step, ti.f32) - offset)
         affine *= APIC / blocks.edge

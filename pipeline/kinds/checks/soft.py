@@ -23,6 +23,8 @@ BYTES_PER_PARTICLE = 560
 """Of the solver with the nodes around a particle, and the snapshots and checkpoints that wait to be written."""
 BYTES_BESIDE_FLUID = 300
 """Of a particle as a sample that fluid feels, on top."""
+BYTES_BESIDE_CLOTH = 90
+"""Of a particle as sheets meet it, on top."""
 FEWEST_CELLS = 3.0
 """Cells across a body, or a block, below which it is told: fewer bend, and are met, in no way that means much."""
 FINEST = 0.4
@@ -60,7 +62,7 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
             total += particles
         total += sum(round(each.emitted_volume(math.inf) / soft.spacing**3) for each in soft.emitter)
         _check_emitters(job, index, solids, findings)
-    each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0)
+    each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0) + (BYTES_BESIDE_CLOTH if job.cloth else 0)
     if refusal := budget.refusal(total, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
     if job.soft and job.fluid:

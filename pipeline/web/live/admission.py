@@ -12,7 +12,7 @@ from pipeline.base.errors import PipelineError
 from pipeline.kinds.elements import count_cloth_nodes
 from pipeline.kinds.live_parameters import Value
 from pipeline.kinds.table import KINDS
-from pipeline.kinds.work import cloth_frame_s, fewest_for_bodies, frame_s, steps_a_frame
+from pipeline.kinds.work import cloth_frame_s, fewest_for_bodies, frame_s, shared_steps, steps_a_frame
 from pipeline.model.job import Job
 from pipeline.web.live.parameters import parameters_of
 from sim.cloth.parameters import ClothParameters, substeps_of
@@ -43,7 +43,7 @@ def live_job(job: Job, *, substeps: int | None = None) -> Job:
         if kind.live is None and kind.bodies(job):
             raise PipelineError(f"{job.name}: {kind.name} does not run live; `pipeline animatic` draws it fast")
     if not (job.moving_bodies or any(kind.bodies(job) for kind in KINDS.values() if kind.name != "rigid")):
-        raise PipelineError(f"{job.name}: nothing moves in it; live runs cloth, rigid bodies and fluids")
+        raise PipelineError(f"{job.name}: nothing moves in it; live runs cloth, rigid bodies, fluids and soft matter")
     changes: dict[str, object] = {}
     if substeps is not None:
         if not job.cloth or job.cloth[0].integrator != "xpbd":
@@ -66,16 +66,17 @@ def computing_power(*, cores: int, on_gpu: bool) -> int:
     return GPU_CORES if on_gpu else cores
 
 
-def require_small(job: Job, particles: int, *, cores: int, on_gpu: bool) -> None:
+def require_small(job: Job, particles: int, soft_particles: int = 0, *, cores: int, on_gpu: bool) -> None:
     """Refuse a scene whose frames would take too long on this many cores, or on a GPU.
 
-    `particles` are those that its fluids will have, as the checks count them: of emitters, what flows in in the film.
+    `particles` are those that its fluids will have, as the checks count them: of emitters, what flows in in the film;
+    `soft_particles` those of its soft matter.
 
     Raises PipelineError: says about how long a frame takes, and what would fit.
     """
     nodes = count_cloth_nodes(job)
     power = computing_power(cores=cores, on_gpu=on_gpu)
-    took_s = frame_s(job, particles, power=power)
+    took_s = frame_s(job, particles, soft_particles, power=power)
     most_s = min(MOST_FRAME_S, MOST_SLOWDOWN / job.fps)
     if took_s <= most_s:
         return
@@ -96,6 +97,10 @@ def require_small(job: Job, particles: int, *, cores: int, on_gpu: bool) -> None
         sizes.append(f"about {particles:,} particles at {steps} {'step' if steps == 1 else 'steps'} a frame")
         # Larger particles, which are fewer, take longer steps: a frame goes by the inverse fourth power of the radius.
         remedies.append(f"about {particles * share**0.75:,.0f} particles fit")
+    if soft_particles:
+        steps = math.ceil(shared_steps(job))
+        sizes.append(f"about {soft_particles:,} particles of soft matter at {steps} steps a frame")
+        remedies.append(f"about {soft_particles * share**0.75:,.0f} of them fit")  # as their steps grow with the cells
     where = "the GPU" if on_gpu else f"{cores} cores"
     raise PipelineError(
         f"{job.name} is too large to steer: {' and '.join(sizes)} take some {took_s:.2g} s a frame on "

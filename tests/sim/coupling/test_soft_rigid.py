@@ -134,9 +134,3 @@ def test_nothing_gets_into_a_body_that_stands_or_is_led(kind):
         top = world.snapshots()["table"].arrays["position"][2] + 0.05
         assert place[:, 2].min() > top - 0.01  # half a cell
     assert world.solvers["soft"].diagnostics()["max_speed"] < 3.0
-
-
-def test_cloth_which_it_would_pass_through_is_refused_by_name():
-    sheet = {"name": "sheet", "shape": {"type": "rectangle", "size": (0.3, 0.3), "counts": (5, 5)}}
-    with pytest.raises(ValueError, match="would pass through cloth; remove one of both"):
-        world_of(soft=[JELLY], cloth=[sheet])

@@ -63,12 +63,16 @@ def test_what_is_too_thin_for_the_grid_is_told_with_the_cells_that_would_do(tmp_
     assert "is 0.05 m thin, less than 3 cells of 0.02 m, and will be too stiff" in output
 
 
-def test_cloth_which_it_would_pass_through_is_refused_by_name(tmp_path):
-    cloth = '[[cloth]]\nname = "sheet"\nshape = { type = "rectangle", size = [0.3, 0.3], resolution = 0.05 }\n'
+def test_cloth_passes_the_checks_and_fluid_beside_both_is_refused_by_name(tmp_path):
+    cloth = '[[cloth]]\nname = "sheet"\nposition = [0.0, 0.0, 0.6]\n'
+    cloth += 'shape = { type = "rectangle", size = [0.3, 0.3], resolution = 0.05 }\n'
     code, output = told(tmp_path, JOB + cloth)
+    assert (code, "warning" in output) == (0, False), output
+    fluid = '[[fluid]]\nname = "water"\nparticle_radius = 0.02\n[[fluid.block]]\n'
+    fluid += 'shape = { type = "box", size = [0.2, 0.2, 0.1] }\nposition = [0.3, 0.0, 0.05]\n'
+    code, output = told(tmp_path, JOB + cloth + fluid)
     assert code == 2
-    told_in_words = "meets walls, rigid bodies, fluids and smoke, and would pass through cloth; remove one of both"
-    assert f"soft[0]: {told_in_words}" in output
+    assert "soft[0]: meets cloth, and meets fluid, but not both in one job: fluid would not feel the cloth" in output
 
 
 def test_cells_are_told_that_fluid_slips_through_or_that_are_far_finer_than_it(tmp_path):

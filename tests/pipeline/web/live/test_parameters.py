@@ -3,9 +3,10 @@
 import pytest
 from live_jobs import BALL_OVER_SHEET, loaded, page_of
 
+from pipeline.base.errors import PipelineError
 from pipeline.job.loading import load_job
 from pipeline.web.drawing.colors import BODY, CLOTH, PIN, srgb
-from pipeline.web.live.admission import live_job
+from pipeline.web.live.admission import live_job, require_small
 from pipeline.web.live.parameters import parameters_of
 from pipeline.web.live.saving import save_job
 from pipeline.web.live.scene import LiveScene
@@ -117,6 +118,70 @@ def test_a_fluid_alone_has_viscosity_and_steps_and_a_saved_job_has_them(tmp_path
     assert (saved.fluid[0].viscosity, saved.fluid[0].cfl) == (1.0e-4, 0.5)
     fixed = loaded(tmp_path, WATER.replace("particle_radius", "dt = 1e-3\nparticle_radius")).job
     assert [knob.name for knob in parameters_of(fixed)] == ["fluid.water.viscosity"]
+
+
+SOFT = """\
+name = "heaps"
+[domain]
+min = [-0.3, -0.3, 0.0]
+max = [0.3, 0.3, 0.5]
+[[soft]]
+name = "jelly"
+material = "jelly"
+cell_size = 0.04
+[[soft.block]]
+shape = { type = "box", size = [0.16, 0.16, 0.16] }
+position = [-0.15, 0.0, 0.09]
+[[soft]]
+name = "sand"
+material = "sand"
+young_modulus = 5e4
+cell_size = 0.04
+[[soft.block]]
+shape = { type = "box", size = [0.16, 0.16, 0.16] }
+position = [0.15, 0.0, 0.09]
+"""
+
+
+@pytest.mark.usefixtures("taichi")
+def test_soft_matter_alone_has_what_it_is_made_of_and_gravity_and_a_saved_job_has_them(tmp_path):
+    read = loaded(tmp_path, SOFT)
+    session = Session(live_job(read.job))
+    knobs = {
+        "soft.jelly.young_modulus",
+        "soft.sand.young_modulus",
+        "soft.sand.friction_angle_deg",
+        "soft.sand.cohesion",
+    }
+    assert set(session.parameters) == {"gravity", *knobs}
+    assert session.values["soft.jelly.young_modulus"] == 1.0e4  # the material's
+    heights = []
+    for stiffness in (1.0e4, 2.0e3):
+        session.reset()
+        session.set("soft.jelly.young_modulus", stiffness)
+        heights.append([])
+        for _ in range(10):
+            session.advance()
+            heights[-1].append(session.bodies()["jelly"].arrays["position"][:, 2].mean())
+    assert min(heights[1]) < min(heights[0]) - 0.005  # softer, it sags deeper
+    with page_server() as server:
+        page_of(server, read, session, tmp_path).show()
+        jelly = session.bodies()["jelly"].arrays["position"]
+        assert server.scene.get_handle_by_name("/soft/jelly").points.shape == jelly.shape
+    session.set("gravity", (0.0, 0.0, 9.81))
+    for _ in range(12):
+        session.advance()
+    assert session.bodies()["sand"].arrays["position"][:, 2].mean() > 0.12
+    assert session.message == ""
+    saved = load_job(save_job(read, session.values, tmp_path)[0])
+    assert (saved.soft[0].young_modulus, saved.gravity) == (2.0e3, (0.0, 0.0, 9.81))
+    with pytest.raises(ValueError, match="density of soft matter cannot change"):
+        session.world.solvers["soft"].change("jelly", density=2.0)
+
+
+def test_soft_matter_that_is_too_large_to_steer_is_told_what_fits(tmp_path):
+    with pytest.raises(PipelineError, match=r"about 500,000 particles of soft matter at \d+ steps .* of them fit"):
+        require_small(live_job(loaded(tmp_path, SOFT).job), 0, 500_000, cores=2, on_gpu=False)
 
 
 @pytest.mark.usefixtures("taichi")

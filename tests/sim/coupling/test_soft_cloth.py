@@ -1,0 +1,235 @@
+"""What soft matter and cloth do to each other: nothing passes, momentum, friction, weight, bits."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from thread_counts import digest_of, result_on_threads
+
+from sim.build import build_world
+from sim.cloth.springs import edges_of
+from sim.coupling.soft_cloth import rims_of
+from sim.scene import SceneParameters
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+SPACE = {"gravity": (0.0, 0.0, 0.0), "domain": {"min": (-0.6, -0.6, -0.6), "max": (0.6, 0.6, 0.6)}}
+CELL = 0.03
+EDGES = tuple({"edge": edge} for edge in ("x-", "x+", "y-", "y+"))
+EVERYWHERE = ({"region": {"type": "sphere", "position": (0.0, 0.0, 0.0), "radius": 9.0}},)
+
+
+def box(size: tuple[float, ...], position: tuple[float, ...], **keys: Any) -> dict[str, Any]:
+    return {"shape": {"type": "box", "size": size}, "position": position, **keys}
+
+
+def matter(*blocks: dict[str, Any], name: str = "matter", material: str = "jelly", **keys: Any) -> dict[str, Any]:
+    return {"name": name, "material": material, "cell_size": CELL, "block": blocks, **keys}
+
+
+def sheet(side: float, count: int, **keys: Any) -> dict[str, Any]:
+    shape = {"type": "rectangle", "size": (side, side), "counts": (count, count)}
+    return {"name": "sheet", "material": "cotton", "air_density": 0.0, "shape": shape, **keys}
+
+
+def world_of(**tables: Any) -> Any:
+    return build_world(SceneParameters.model_validate(tables), frames_per_second=60)
+
+
+def momenta(world: Any) -> list[np.ndarray]:
+    """Of soft matter and of cloth [N s]."""
+    told = [world.solvers[name].diagnostics() for name in ("soft", "cloth")]
+    return [np.array([each[f"momentum_{axis}"] for axis in "xyz"]) for each in told]
+
+
+def gaps(world: Any) -> np.ndarray:
+    """Height of each particle over the sheet right below or above it [m]; (n,) of those that have one."""
+    cloth = world.solvers["cloth"]
+    corners = cloth.state.positions()[cloth.state.host.triangles]
+    first, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    found = []
+    for x in world.solvers["soft"].view("matter")["position"].astype(float):
+        w = x - first
+        s, t = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area, (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
+        inside = (s >= 0.0) & (t >= 0.0) & (s + t <= 1.0)
+        found += (w[:, 2] - s * u[:, 2] - t * v[:, 2])[inside].tolist()[:1]
+    return np.array(found)
+
+
+def test_sand_that_falls_into_a_hammock_stays_in_it():
+    """Sand of three kilogrammes falls into a sheet of 50 g, which gives way by a third of its width."""
+    half = 0.2
+    ball = {"shape": {"type": "sphere", "radius": 0.08}, "position": (0.02, 0.0, 0.1), "velocity": (0.5, 0.0, -3.0)}
+    world = world_of(
+        domain={"min": (-half, -half, -0.4), "max": (half, half, 0.8)},
+        soft=[matter(ball, material="sand", young_modulus=5.0e4)],
+        cloth=[sheet(2.0 * half + 0.01, 15, pin=EDGES)],
+    )
+    count, depths = world.solvers["soft"].particles.count, []
+    for _ in range(24):
+        world.advance_frame()
+        over = gaps(world)
+        assert len(over) == count
+        assert over.min() > 1.0e-4
+        depths.append(world.solvers["cloth"].view("sheet")["position"][:, 2].min())
+    assert min(depths) < -0.08
+    assert world.solvers["soft"].diagnostics()["particles_left"] == 0.0
+
+
+def test_sand_lies_on_a_held_sheet_as_on_a_floor():
+    """To a thousandth of a cell where both are on a plane of nodes, to a part of one between such planes."""
+    half = 0.09
+    heights = []
+    for floor, pinned in ((0.0, 0.4), (-7 * CELL, 0.0), (-6.6 * CELL, 0.0)):
+        world = world_of(
+            domain={"min": (-half, -half, floor), "max": (half, half, 0.5)},
+            soft=[matter(box((2 * half, 2 * half, 0.09), (0.0, 0.0, 0.046)), material="sand", young_modulus=1.0e5)],
+            cloth=[sheet(2.0 * half + 0.02, 9, position=(0.0, 0.0, pinned), pin=EVERYWHERE)],
+        )
+        for _ in range(15):
+            world.advance_frame()
+        heights.append(np.sort(world.solvers["soft"].view("matter")["position"][:, 2]))
+    np.testing.assert_allclose(heights[1], heights[0], atol=0.002 * CELL)
+    np.testing.assert_allclose(heights[2], heights[0], atol=0.1 * CELL)
+
+
+@pytest.mark.parametrize("mass_per_area", [0.1, 5.0])
+def test_a_sheet_gets_what_jelly_loses(mass_per_area):
+    """However light the sheet is, it is not thrown back and forth."""
+    world = world_of(
+        **SPACE,
+        soft=[matter(box((0.12, 0.12, 0.12), (0.02, 0.0, 0.1), velocity=(0.3, 0.0, -1.5)))],
+        cloth=[sheet(0.3, 13, mass_per_area=mass_per_area)],
+    )
+    before = momenta(world)
+    for _ in range(10):
+        world.advance_frame()
+    now = momenta(world)
+    taken = np.linalg.norm(now[1] - before[1])
+    assert taken > 0.5 * mass_per_area * 0.12**2 * 1.5
+    np.testing.assert_allclose(sum(now), sum(before), atol=2.0e-6 * np.linalg.norm(before[0]))
+    assert world.solvers["cloth"].diagnostics()["max_speed"] < 6.0
+
+
+def test_a_sheet_glues_nothing_together():
+    """Two bodies in touch with both faces of a sheet fly apart as if it were not there."""
+    blocks = [
+        matter(box((0.12, 0.12, 0.12), (0.0, 0.0, side * 0.065), velocity=(0.0, 0.0, side)), name=name)
+        for name, side in (("upper", 1.0), ("lower", -1.0))
+    ]
+    world = world_of(**SPACE, soft=blocks, cloth=[sheet(0.2, 11)])
+    for _ in range(6):
+        world.advance_frame()
+    for name, side in (("upper", 1.0), ("lower", -1.0)):
+        motion = world.solvers["soft"].view(name)
+        np.testing.assert_allclose(motion["velocity"][:, 2], side, atol=1.0e-3)
+        assert (side * motion["position"][:, 2]).min() > 0.1
+    assert world.solvers["cloth"].diagnostics()["max_speed"] < 1.0e-3
+
+
+def test_a_push_goes_through_a_sheet():
+    """What hits one face moves what lies on the other, and parts from it again."""
+    blocks = [
+        matter(box((0.12, 0.12, 0.12), (0.0, 0.0, 0.075), velocity=(0.0, 0.0, -1.0)), name="upper"),
+        matter(box((0.12, 0.12, 0.12), (0.0, 0.0, -0.065)), name="lower"),
+    ]
+    world = world_of(**SPACE, soft=blocks, cloth=[sheet(0.2, 11)])
+    for _ in range(12):
+        world.advance_frame()
+    upper, lower = (world.solvers["soft"].view(name) for name in ("upper", "lower"))
+    assert lower["velocity"][:, 2].mean() < -0.6
+    assert upper["velocity"][:, 2].mean() > -0.4
+    sag = world.solvers["cloth"].view("sheet")["position"][:, 2]
+    assert upper["position"][:, 2].min() > lower["position"][:, 2].max()
+    assert lower["position"][:, 2].max() < sag.max()
+
+
+def test_jelly_slides_to_rest_on_cloth_by_its_friction():
+    """Under Coulomb's friction v = v_0 - mu g t; what jelly wobbles passes within some frames."""
+    friction = 0.3
+    world = world_of(
+        domain={"min": (-0.6, -0.2, -0.2), "max": (0.6, 0.2, 0.4)},
+        soft=[matter(box((0.18, 0.18, 0.09), (-0.2, 0.0, 0.047), velocity=(1.0, 0.0, 0.0)), friction=friction)],
+        cloth=[sheet(1.0, 21, pin=EVERYWHERE, friction=friction)],
+    )
+    speeds = []
+    for _ in range(18):
+        world.advance_frame()
+        speeds.append(world.solvers["soft"].view("matter")["velocity"][:, 0].mean())
+    slowing = -np.polyfit(np.arange(len(speeds)) / 60.0, speeds, 1)[0]
+    assert slowing == pytest.approx(friction * 9.81, rel=0.1)
+
+
+def test_a_blanket_lies_on_jelly_and_does_not_sink_in():
+    world = world_of(
+        domain={"min": (-0.2, -0.2, 0.0), "max": (0.2, 0.2, 0.4)},
+        soft=[matter(box((0.18, 0.18, 0.12), (0.0, 0.0, 0.06)))],
+        cloth=[sheet(0.26, 14, position=(0.0, 0.0, 0.15), air_density=1.2)],
+    )
+    for _ in range(45):
+        world.advance_frame()
+    assert gaps(world).max() < -1.0e-4
+    jelly, cloth = (world.solvers[name].view(body) for name, body in (("soft", "matter"), ("cloth", "sheet")))
+    top = jelly["position"][:, 2].max()
+    over = cloth["position"][(np.abs(cloth["position"][:, :2]) < 0.07).all(axis=1), 2]
+    assert ((over > top) & (over < top + CELL)).all()
+    assert np.abs(cloth["velocity"]).max() < 0.4
+    assert cloth["position"][:, 2].min() < top - 0.02  # its rim hangs down
+
+
+def run_in_hammock(checkpoint: str, resume: bool) -> str:
+    """Digest of sand in a hammock, whole or from a checkpoint on."""
+    ball = {"shape": {"type": "sphere", "radius": 0.06}, "position": (0.0, 0.0, 0.08), "velocity": (0.3, 0.0, -2.0)}
+    world = world_of(
+        domain={"min": (-0.3, -0.3, -0.4), "max": (0.3, 0.3, 0.6)},
+        soft=[matter(ball, material="sand", young_modulus=5.0e4)],
+        cloth=[sheet(0.3, 11, pin=EDGES)],
+    )
+    if resume:
+        with np.load(checkpoint) as arrays:
+            world.restore(3, dict(arrays))
+    else:
+        for _ in range(3):
+            world.advance_frame()
+        np.savez(checkpoint, **world.checkpoint())
+    for _ in range(3):
+        world.advance_frame()
+    return digest_of(world.checkpoint())
+
+
+@pytest.mark.slow
+def test_bits_are_those_of_a_run_that_was_not_killed_whatever_the_threads(taichi_cpu, tmp_path):
+    if taichi_cpu != "cpu":
+        pytest.skip("compares numbers of threads")
+    checkpoint = str(tmp_path / "checkpoint.npz")
+    whole = result_on_threads(1, run_in_hammock, checkpoint, False)
+    assert result_on_threads(2, run_in_hammock, checkpoint, True) == whole
+
+
+def test_rims_are_the_sides_and_corners_of_one_triangle():
+    """A square of two triangles: all sides but the diagonal are rims, and all corners."""
+    triangles = np.array([[0, 1, 2], [1, 3, 2]], dtype=np.int32)
+    edges = edges_of(triangles)
+    assert rims_of(triangles, edges.of_side).tolist() == [0b111110, 0b111101]
+
+
+def test_fluid_beside_both_is_refused_by_name():
+    water = {"name": "water", "particle_radius": 0.01, "block": [box((0.1, 0.1, 0.1), (0.0, 0.0, 0.3))]}
+    jelly = matter(box((0.12, 0.12, 0.12), (0.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match="fluid would not feel the cloth; remove one of the three"):
+        world_of(**SPACE, fluid=[water], soft=[jelly], cloth=[sheet(0.2, 5)])
+
+
+def test_forces_that_it_would_feel_twice_are_refused_by_name():
+    jelly, cloth = matter(box((0.12, 0.12, 0.12), (0.0, 0.0, 0.0))), sheet(0.2, 5)
+    pull = {"type": "gravity", "acceleration": (0.0, 0.0, 1.0)}
+    with pytest.raises(ValueError, match='"gravity" acts on cloth in a job with soft matter'):
+        world_of(**SPACE, soft=[jelly], cloth=[cloth], force=[pull])
+    SceneParameters.model_validate({**SPACE, "soft": [jelly], "cloth": [cloth], "force": [pull | {"only": ["matter"]}]})
+
+
+def test_explicit_cloth_is_refused_by_name():
+    jelly = matter(box((0.12, 0.12, 0.12), (0.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match='"explicit" takes thousands of substeps a frame'):
+        world_of(**SPACE, soft=[jelly], cloth=[sheet(0.2, 5, integrator="explicit")])
