@@ -153,7 +153,7 @@ def yielded_sand(strain: Vector, b: ti.i32, gained: ti.f32, laws: Laws):
 def kept_beyond(beyond: ti.f32, b: ti.i32, dt: ti.f32, laws: Laws) -> ti.f32:
     """Share x of the deviator d beyond the yield strain that is left after dt [s].
 
-    x + dt/flowing d^(power - 1) x^power = 1; Newton's method, from above on a convex curve, no farther than twice the root.
+    x + dt/flowing d^(power - 1) x^power = 1; Newton's method from above on a convex curve, within twice the root.
     """
     flowing, power = laws.flowing[b], laws.power[b]
     kept = flowing / (flowing + dt)
