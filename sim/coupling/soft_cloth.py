@@ -127,16 +127,8 @@ class SoftClothCoupling(Coupling):
         """Lay what meets the sheets onto their nodes."""
         soft = self._soft
         self._sheets = self._sheets._replace(speed_unit=self._blocks.edge / dt)
-        given = (
-            soft.particles,
-            soft.masses,
-            soft.volume,
-            self._sheets,
-            self._met,
-            soft.parting,
-            ti.math.vec3(soft.gravity),
-        )
-        meet(self._blocks, *given, dt)
+        met = soft.masses, soft.volume, self._sheets, self._met, soft.parting
+        meet(self._blocks, soft.particles, *met, ti.math.vec3(soft.gravity), dt)
         take_sums(self._sheets, self._load.mass, self._load.impulse)
 
     def follow(self, dt: float) -> None:

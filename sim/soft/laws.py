@@ -24,6 +24,7 @@ Vector = ti.math.vec3
 
 SWEEPS = 4  # of Jacobi's rotations, which converge quadratically: off-diagonals vanish in single precision
 SMALL = 0.3  # up to which series of log1p and expm1 are taken, whose next terms are below 1e-7
+NEWTON = 6  # steps of Newton's method: the root is within twice of where it starts
 MOST_HARDENED, LEAST_HARDENED = 3.0, -2.0
 """Exponents of snow's hardening at most and at least, exp(3) = 20 times as stiff: steps get shorter with its root."""
 
@@ -38,7 +39,9 @@ class Laws(NamedTuple):
     slope: Floats  # SAND: of the cone, |s| over 3 p, sqrt(2)/3 tan(phi) [-]
     tip: Floats  # SAND: Hencky strain of volume that cohesion bears [-]
     yielding: Floats  # CLAY: norm of the deviatoric Hencky strain at which it yields [-]
-    flowing: Floats  # CLAY: time in which what is beyond decays, eta/mu [s]
+    flowing: Floats  # CLAY: its deviator beyond that, d, decays as d' = -d^power/flowing; sqrt(2)^(1 - power)
+    # (K/mu)^power [s]
+    power: Floats  # CLAY: 1 over Herschel and Bulkley's exponent, 1 or more [-]
     least: Floats  # SNOW: least and largest stretch [-]
     most: Floats
     hardening: Floats  # SNOW [-]
@@ -147,18 +150,37 @@ def yielded_sand(strain: Vector, b: ti.i32, gained: ti.f32, laws: Laws):
 
 
 @func
+def kept_beyond(beyond: ti.f32, b: ti.i32, dt: ti.f32, laws: Laws) -> ti.f32:
+    """Share x of the deviator d beyond the yield strain that is left after dt [s].
+
+    x + dt/flowing d^(power - 1) x^power = 1; Newton's method from above on a convex curve, within twice the root.
+    """
+    flowing, power = laws.flowing[b], laws.power[b]
+    kept = flowing / (flowing + dt)
+    if power > 1.0 and flowing > 0.0 and beyond > 0.0:
+        rate = dt / flowing * beyond ** (power - 1.0)
+        start = ti.min(1.0, rate ** (-1.0 / power))
+        steep = ti.min(1.0, rate)
+        part = 1.0
+        for _ in range(NEWTON):
+            high = part ** (power - 1.0)
+            part -= (start * part + steep * high * part - 1.0) / (start + steep * power * high)
+        kept = start * part
+    return kept
+
+
+@func
 def yielded_clay(strain: Vector, b: ti.i32, dt: ti.f32, laws: Laws) -> Vector:
-    """Hencky strains of a Bingham solid after dt [s] (Simo & Hughes 1998, 2.7, implicit).
+    """Hencky strains of a solid of Herschel and Bulkley after dt [s] (Simo & Hughes 1998, 2.7, implicit).
 
-    What of the deviator is beyond von Mises' cylinder decays, at once without viscosity.
-
-    With |s| = 2 mu |d| and a rate of (|s| - yield)/(2 eta), it becomes 1/(1 + dt mu/eta) of itself.
+    What of the deviator is beyond von Mises' cylinder decays, at once without viscosity. A shear stress of tau flows at
+    the rate ((tau - yield)/K)^(1/n) (Yue et al. 2015); |s| = sqrt(2) tau = 2 mu |d|.
     """
     mean = strain.sum() / 3.0
     deviator = strain - mean
     norm = deviator.norm()
     beyond = ti.max(norm - laws.yielding[b], 0.0)
-    kept = laws.flowing[b] / (laws.flowing[b] + dt)
+    kept = kept_beyond(beyond, b, dt, laws)
     return strain - (1.0 - kept) * beyond / ti.max(norm, 1.0e-20) * deviator
 
 

@@ -16,7 +16,7 @@ class Law(IntEnum):
     ELASTIC = 0  # neo-Hookean
     SAND = 1  # Hencky strains, Drucker-Prager
     SNOW = 2  # fixed corotated, breaks beyond critical stretches, hardens
-    CLAY = 3  # Hencky strains, von Mises, flows as a Bingham fluid
+    CLAY = 3  # Hencky strains, von Mises, flows as Herschel and Bulkley say
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class MaterialRow:
     friction_angle_deg: float | None = None  # SAND [degrees]
     cohesion: float | None = None  # SAND: shear stress that it bears without pressure [Pa]
     yield_stress: float | None = None  # CLAY [Pa]
-    viscosity: float | None = None  # CLAY, beyond its yield stress [Pa s]
+    viscosity: float | None = None  # CLAY, beyond its yield stress [Pa s^n], n its
+    flow_exponent: float | None = None  # CLAY [-]
     critical_compression: float | None = None  # SNOW: shortening, and
     critical_stretch: float | None = None  # SNOW: lengthening beyond which it breaks [-]
     hardening: float | None = None  # SNOW [-]
@@ -69,6 +70,7 @@ LAW_KEYS: dict[str, Law] = {
     "cohesion": Law.SAND,
     "yield_stress": Law.CLAY,
     "viscosity": Law.CLAY,
+    "flow_exponent": Law.CLAY,
     "critical_compression": Law.SNOW,
     "critical_stretch": Law.SNOW,
     "hardening": Law.SNOW,

@@ -67,7 +67,14 @@ class SoftParameters(Parameters):
         default=None, description="Stress in tension from which on it flows (von Mises) [Pa]; of clay, dough and cream."
     )
     viscosity: NonNegative | None = Field(
-        default=None, description="Viscosity beyond the yield stress (Bingham) [Pa s]; of clay, dough and cream."
+        default=None,
+        description="Viscosity beyond the yield stress [Pa s^n], n the flow_exponent; of clay, dough and cream.",
+    )
+    flow_exponent: Annotated[float, Field(ge=0.2, le=1.0)] | None = Field(
+        default=None,
+        description="Exponent n of shear rate: in shear the stress is that of yield plus viscosity times rate^n "
+        "(Herschel and Bulkley); 1 is Bingham's, less thins where it flows fast, as foams do [-]; of clay, dough and "
+        "cream.",
     )
     critical_compression: Annotated[float, Field(gt=0.0, lt=0.5)] | None = Field(
         default=None, description="Shortening from which on it is crushed [-]; of snow."
@@ -102,6 +109,12 @@ class SoftParameters(Parameters):
             if key in self.model_fields_set and law != self.row.law:
                 names = " or ".join(f'"{name}"' for name, row in MATERIALS.items() if row.law == law)
                 raise ValueError(f'{key} is for material = {names}; remove it, as "{self.material}" has none')
+        return self
+
+    @model_validator(mode="after")
+    def _flows_with_viscosity(self) -> Self:
+        if self.flow_exponent is not None and self.value("viscosity") == 0.0:
+            raise ValueError("flow_exponent has no meaning without viscosity; add one, or remove it")
         return self
 
     @property

@@ -358,6 +358,8 @@ def laws_of(parameters: Sequence[SoftParameters]) -> Laws:
         tip = math.sqrt(2.0) * each.value("cohesion") / ((3.0 * lam + 2.0 * mu) * slope) if slope > 0.0 else 0.0
         yielding = math.sqrt(2.0 / 3.0) * each.value("yield_stress") / (2.0 * mu)
         least, most = 1.0 - each.value("critical_compression"), 1.0 + each.value("critical_stretch")
-        rows.append((mu, lam, slope, tip, yielding, each.value("viscosity") / mu, least, most, each.value("hardening")))
+        power = 1.0 / (each.value("flow_exponent") or 1.0)
+        flowing = 2.0 ** (0.5 - 0.5 * power) * (each.value("viscosity") / mu) ** power
+        rows.append((mu, lam, slope, tip, yielding, flowing, power, least, most, each.value("hardening")))
     law = np.array([int(each.row.law) for each in parameters], dtype=np.int32)
     return Laws(on_device(law), *(on_device(np.array(column)) for column in zip(*rows, strict=True)))

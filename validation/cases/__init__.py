@@ -18,7 +18,7 @@ CASES = (
     "kernel", "hydrostatic", "dam-break", "box-impact", "turned-jet", "rayleigh-taylor", "elliptical-drop",
     "swinging-drop", "viscosity",
     "free-momentum", "coupled-momentum", "rigid-motion", "rigid-contacts", "joints", "pyramid", "inertia",
-    "cloth", "cloth-crossings", "soft-bar",
+    "cloth", "cloth-crossings", "soft-bar", "sand-columns",
     "smoke-vortices", "smoke-projection", "smoke-solids", "smoke-wake", "smoke-plume", "smoke-front", "smoke-mass",
     "submerged-sphere", "buoyancy", "bunny-energy",
 )  # fmt: skip

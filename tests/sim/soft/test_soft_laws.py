@@ -200,6 +200,27 @@ def test_dough_flows_the_faster_the_more_it_is_beyond_its_yield_stress():
     assert stresses[-1] < 0.8 * start
 
 
+@pytest.mark.parametrize("exponent", [1.0, 0.5, 0.25])
+@pytest.mark.parametrize("rate", [0.1, 10.0])
+def test_steady_shear_has_the_stress_of_herschel_and_bulkley(exponent, rate):
+    body = soft("cream", young_modulus=1.0e5, yield_stress=60.0, viscosity=20.0, flow_exponent=exponent)
+    expected = 60.0 / math.sqrt(3.0) + 20.0 * rate**exponent
+    # Long enough for ten times the elastic strain that the stress needs, in steps of a hundredth of it.
+    dt = 0.01 * expected / body.lame[0] / rate
+    gradient = np.zeros((1, 3, 3))
+    gradient[0, 0, 1] = rate * dt
+    strain, after = np.zeros((1, 3, 3)), matrices(np.zeros((1, 3, 3)))
+    for _ in range(1000):
+        move(matrices(strain), matrices(gradient), after)
+        strain, stress, _ = answered(body, after.to_numpy(), dt=dt)
+    assert stress[0, 0, 1] == pytest.approx(expected, rel=5e-3)
+
+
+def test_an_exponent_needs_a_viscosity():
+    with pytest.raises(ValueError, match="flow_exponent has no meaning without viscosity"):
+        soft("clay", flow_exponent=0.5)
+
+
 def test_snow_breaks_beyond_its_stretches_and_is_harder_once_crushed():
     body, (turn,) = soft("snow"), random_turns(1)
     strain, _, told = answered(body, [strains_of([0.05, 0.0, -0.05], turn), strains_of([-0.1] * 3, turn)])

@@ -81,6 +81,32 @@ def test_a_free_bar_swings_along_itself_at_its_frequency_and_keeps_its_energy():
     assert share[np.argmin(np.abs(np.array(times) - 1.0 / expected))] > 0.97
 
 
+def test_a_bar_that_hits_a_wall_end_on_flies_back_as_fast_after_two_crossings_of_its_wave():
+    length, speed, young, density = 0.4, 0.2, 1.0e5, 1050.0
+    body = soft(
+        size=(length, 0.08, 0.08),
+        position=(-0.28, 0.0, 0.0),
+        velocity=(-speed, 0.0, 0.0),
+        young_modulus=young,
+        poisson_ratio=0.0,
+        friction=0.0,
+    )
+    solver = SoftSolver([body], domain=DOMAIN, gravity=FREE)
+    wave = math.sqrt(young / density)
+    gap, times, speeds = 0.02, [], []
+
+    def watch(now):
+        times.append(now)
+        speeds.append(momentum(solver)[0] / solver.mass)
+
+    advance(solver, gap / speed + 3.0 * length / wave, watch)
+    times, speeds = np.array(times), np.array(speeds)
+    # One-dimensional: the wall pushes with rho c v from the first touch until the wave is back.
+    assert speeds[-1] == pytest.approx(speed, rel=0.05)
+    push = np.interp([-0.5 * speed, 0.5 * speed], speeds, times)
+    assert push[1] - push[0] == pytest.approx(length / wave, rel=0.05)
+
+
 def test_it_falls_as_all_things_do():
     solver = SoftSolver([soft(position=(0.0, 0.0, 0.2))], domain=DOMAIN, gravity=(0.0, 0.0, -GRAVITY))
     before = solver.diagnostics()["centre_of_mass_z"]
