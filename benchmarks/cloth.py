@@ -2,6 +2,7 @@
 
     python -m benchmarks.cloth --nodes 128 --substeps 20 --device cpu [--without-contacts] [--blender]
     python -m benchmarks.cloth --scene funnel --nodes 256 --frames 90 --device cuda [--by-kernel]
+    python -m benchmarks.cloth --figures [--device cuda]
 
 A square metre of cloth falls flat onto a ball, drapes itself around it and reaches the floor; the funnel is that of
 `validation.cases.cloth_crossings`. Times are of whole frames at 60 frames a second, contacts with the ball, the floor
@@ -10,12 +11,15 @@ pairs of elements stand beside them. The processor time of all threads is told, 
 do not enter it (on a GPU it says nothing). Parts of a substep are timed apart, at the end, where the cloth is folded
 most; contacts in one more frame, as lists last only while cloth moves as it does in a run. With `--by-kernel` a GPU's
 own time of each kernel in the last frames is told. With `--blender` Blender's own cloth (bpy of this Python) does the
-same drop of the same mesh; both results are described by the same numbers.
+same drop of the same mesh; both results are described by the same numbers. With `--figures` the scenes that speed is
+judged by on this device are run one after the other, and a row of a Markdown table is printed for each.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import tempfile
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -43,6 +47,14 @@ THICKNESS_IN_SPACINGS = 0.5
 
 FRAMES_PER_SECOND = 60.0
 
+FIGURES = {
+    "cpu": (("ball", 128, 60), ("ball", 100, 60)),
+    "cuda": (("ball", 128, 60), ("ball", 512, 25), ("funnel", 256, 50)),
+}
+"""Scenes, nodes a side and frames that speed is judged by."""
+
+LIVE_SUBSTEPS = (20, 10)
+"""Substeps a frame of a live scene: as written, and the fewest that `pipeline live` takes by itself."""
 
 BY_KERNEL_FRAMES = 2
 """Frames in which a GPU's time of each kernel is taken."""
@@ -272,8 +284,42 @@ def drop_in_blender(nodes: int, frames: int) -> dict[str, Any]:
     }
 
 
-def main() -> dict[str, Any]:
+def print_figures(arguments: argparse.Namespace) -> None:
+    """A row for each scene, and on a CPU for Blender beside one, for live and for the first frame of cold kernels."""
+    device = "cpu" if arguments.device == "cpu" else "cuda"
+    print("| scene | ms a frame: median, worst | processor time | substeps, contacts, pairs: most | strain |")
+    print("|---|---|---|---|---|")
+    for scene_name, nodes, frames in FIGURES[device]:
+        its = argparse.Namespace(**{**vars(arguments), "scene": scene_name, "frames": frames})
+        drop = measure(nodes, its)
+        wall, processor = drop["frame_ms"], drop["frame_processor_ms"]
+        print(
+            f"| {scene_name}, {nodes}² | {wall['median']:.1f}, {wall['most']:.1f} | {processor['median']:.0f} | "
+            f"{drop['substeps']['most']}, {drop['contacts']['most']:.0f}, {drop['listed_pairs']['most']} | "
+            f"{drop['diagnostics']['max_strain']:.3f} |",
+            flush=True,
+        )
+    if device != "cpu":
+        return
+    blender = measure_blender(nodes, frames, min(arguments.from_frame, frames) - 1)
+    over, spent = blender["frame_ms"]["median"], blender["frame_processor_ms"]["median"]
+    print(f"| Blender, the last again | {over:.0f}, {over / wall['median']:.1f} times | ", end="")
+    print(f"{spent:.0f}, {spent / processor['median']:.1f} times | | |", flush=True)
+    counts = [str(count) for count in LIVE_SUBSTEPS]
+    for live in child(["-m", "benchmarks.live", "--nodes", "100", "--substeps", *counts])["results"]:
+        for name in ("falls", "dragged"):
+            its = live[name]
+            print(f"| live, 100², {name}: {its['frames_per_second']:.1f} frames/s | {its['frame_ms']:.0f} | ", end="")
+            print(f"{its['processor_ms']:.0f} | {its['substeps_taken']:.0f} | {its['max_strain']:.3f} |", flush=True)
+    with tempfile.TemporaryDirectory() as cold:
+        environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": cold}
+        (first,) = child(["-m", "benchmarks.cloth", "--nodes", "128", "--frames", "1"], env=environment)["runs"]
+    print(f"| first frame, 128², cold kernels | {first['by_frame']['wall'][0]:.0f} | | | |")
+
+
+def main() -> dict[str, Any] | None:
     parser = arguments_of(__doc__)
+    parser.add_argument("--figures", action="store_true", help="the scenes that speed is judged by, as a table")
     parser.add_argument("--scene", choices=("ball", "funnel"), default="ball")
     parser.add_argument("--nodes", type=int, nargs="+", default=[100], help="along each side, one fall each")
     parser.add_argument("--substeps", type=int, default=20)
@@ -290,6 +336,9 @@ def main() -> dict[str, Any]:
     if asked.as_blender:
         return drop_in_blender(asked.nodes[0], asked.frames)
     arguments = start_taichi(parser)
+    if arguments.figures:
+        print_figures(arguments)
+        return None
     runs = []
     for nodes in arguments.nodes:
         drop = measure(nodes, arguments)

@@ -283,13 +283,15 @@ def pair_patches(
 def approach_of(m: ti.i32, other: ti.i32, motion: PatchMotion) -> ti.f32:
     """How much nearer points of two patches come at most [m].
 
-    With w and c of the first patch, points P and Q go to P + c + w x P + d and Q + c + w x Q + d', where d and d' are
-    what is left. P - Q + w x (P - Q) is never shorter than P - Q, so that distances shrink by |d| + |d'| at most.
+    With any w and c, points P and Q go to P + c + w x P + d and Q + c + w x Q + d'. P - Q + w x (P - Q) is never
+    shorter than P - Q, so that distances shrink by |d| + |d'| at most. With the mean of their turns as w that is least
+    where neighbours bend about what they share: their middles then move as w says, and both turn against it by half.
     """
-    between = motion.centre[other] - motion.centre[m]
-    turned = (motion.turn[other] - motion.turn[m]).norm() * motion.radius[other] if m != other else 0.0
-    shifted = (motion.shift[other] - motion.shift[m] - motion.turn[m].cross(between)).norm() if m != other else 0.0
-    nearer = motion.rest[m] + motion.rest[other] + turned + shifted
+    turn, nearer = 0.5 * (motion.turn[m] + motion.turn[other]), motion.rest[m] + motion.rest[other]
+    if m != other:
+        between = motion.centre[other] - motion.centre[m]
+        nearer += 0.5 * (motion.turn[other] - motion.turn[m]).norm() * (motion.radius[m] + motion.radius[other])
+        nearer += (motion.shift[other] - motion.shift[m] - turn.cross(between)).norm()
     return nearer + SAFETY * nearer
 
 
