@@ -8,7 +8,7 @@ from thread_counts import digest_of, result_on_threads
 
 from sim.build import build_world
 from sim.cloth.springs import edges_of
-from sim.coupling.soft_cloth import rims_of
+from sim.coupling.soft_cloth import SoftClothCoupling, find_crossings, put_back, rims_of
 from sim.scene import SceneParameters
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -176,6 +176,36 @@ def test_a_blanket_lies_on_jelly_and_does_not_sink_in():
     assert ((over > top) & (over < top + CELL)).all()
     assert np.abs(cloth["velocity"]).max() < 0.4
     assert cloth["position"][:, 2].min() < top - 0.02  # its rim hangs down
+
+
+def test_what_has_crossed_a_triangle_is_put_back_to_its_side():
+    """Particles are put behind a sheet whose nodes move past others: some cross it down, some are crossed by it."""
+    world = world_of(
+        **SPACE,
+        soft=[matter(box((0.12, 0.12, 0.06), (0.0, 0.0, 0.031)), box((0.12, 0.12, 0.06), (0.0, 0.0, -0.031)))],
+        cloth=[sheet(0.2, 11, pin=EVERYWHERE)],
+    )
+    world.advance_frame()
+    coupling = next(each for each in world._couplings if isinstance(each, SoftClothCoupling))
+    particles, sheets, met, blocks = coupling._soft.particles, coupling._sheets, coupling._met, coupling._blocks
+    coupling._find_hidden(blocks, coupling._stored)
+    nodes = sheets.before.to_numpy()
+    raised = nodes + np.where(nodes[:, :1] > 0.0, 0.012, 0.0) * np.array([0.0, 0.0, 1.0])
+    sheets.place.from_numpy(raised.astype(np.float32))
+    start = particles.position.to_numpy()
+    thrown = start.copy()
+    falls = (start[:, 0] < -0.02) & (np.abs(start[:, 2] - 0.01) < 0.01)
+    is_hit = (start[:, 0] > 0.02) & (start[:, 2] > 0.0) & (start[:, 2] < 0.011)
+    thrown[falls, 2] -= 0.02
+    particles.position.from_numpy(thrown)
+    assert find_crossings(blocks, particles, sheets, met) == falls.sum() + is_hit.sum() > 20
+    put_back(particles, sheets, met, 1.0e-4)
+    now = particles.position.to_numpy()
+    np.testing.assert_allclose(now[falls, 2], 1.0e-4, atol=1.0e-6)
+    np.testing.assert_allclose(now[is_hit, 2], 0.0121, atol=1.0e-6)
+    others = ~(falls | is_hit)
+    np.testing.assert_array_equal(now[others], thrown[others])
+    assert find_crossings(blocks, particles, sheets, met) == 0
 
 
 def run_in_hammock(checkpoint: str, resume: bool) -> str:
