@@ -9,7 +9,7 @@ from sim.cloth.bundles import Air, Nodes
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
-from sim.core.arrays import Integers, Vectors, on_device
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import with_room
 from sim.core.launch import kernel
 from sim.core.parameters import KeyRefusedError, Vector3
@@ -129,12 +129,13 @@ def blow_at_triangles(air: Air, wind: Vectors, source: Integers, position: Vecto
 
 
 @kernel
-def push_nodes(nodes: Nodes, position: Vectors, body: Integers, forces: ForceTable, dt: ti.f32):
-    """Change velocities of nodes that nothing holds by forces from outside."""
+def push_nodes(nodes: Nodes, position: Vectors, body: Integers, carried: Floats, forces: ForceTable, dt: ti.f32):
+    """Change velocities of nodes that nothing holds by forces from outside, which what they carry has felt already."""
     for i in range(position.shape[0]):
         if nodes.inverse_mass[i] > 0.0:
             v_i = nodes.velocity[i]
-            nodes.velocity[i] = v_i + change_of_velocity(forces, body[i], position[i], v_i, dt)
+            own = 1.0 - carried[i] * nodes.inverse_mass[i]  # share in the mass of both
+            nodes.velocity[i] = v_i + own * change_of_velocity(forces, body[i], position[i], v_i, dt)
 
 
 @kernel

@@ -228,7 +228,8 @@ class ClothSolver:
         for load in self.loads:
             load.put_on(self.state, self.gravity, dt)
         if self._forces.accelerates:
-            push_nodes(self.state.nodes, self.state.position, self.state.body, self._forces.now, dt)
+            state = self.state
+            push_nodes(state.nodes, state.position, state.body, state.carried, self._forces.now, dt)
         if self._forces.blows and self.air.acts:
             self.air.blow(self._forces)
         self._integrator.accelerate(dt)

@@ -98,6 +98,7 @@ class ClothState:
         nodes, surface: arrays for kernels; each also an attribute of its own.
         elastic: by how much triangles of meshes displaced nodes in the last step [m], (n,) vec3; 0 elsewhere.
         mass: of a node [kg], (n,), pinned or not.
+        carried: what moves along with a node in a substep without weighing on it [kg], (n,).
         body: cloth of a node, (n,) int32.
         triangles: (k,) ivec3.
         names: of the cloths.
@@ -124,7 +125,7 @@ class ClothState:
         self.lattice, _, self.inverse_mass, self.displacement, self.carry, self.velocity = self.nodes
         self.position, _, self.thickness, self.friction = self.surface
         self.elastic = ti.Vector.ndarray(3, ti.f32, n)
-        self.mass = ti.ndarray(ti.f32, n)
+        self.mass, self.carried = ti.ndarray(ti.f32, n), ti.ndarray(ti.f32, n)
         self.body, self.triangles = on_device(host.body), on_device(host.triangles)
         self.eyelets = np.zeros(n)
         self.self_collision: tuple[bool, ...] = ()
@@ -271,13 +272,12 @@ class NodeLoad:
 
     def put_on(self, state: ClothState, gravity: Vector3, dt: float) -> None:
         """Let the nodes take their impulses and carry their loads; gravity [m/s²] is what they will feel in dt [s]."""
-        put_on_load(
-            self.mass, self.impulse, ti.math.vec3(*gravity), dt, state.inverse_mass, self._own_inverse, state.velocity
-        )
+        nodes = state.inverse_mass, self._own_inverse, state.carried, state.velocity
+        put_on_load(self.mass, self.impulse, ti.math.vec3(*gravity), dt, *nodes)
 
     def take_off(self, state: ClothState) -> None:
         """Give the nodes their own masses back."""
-        take_off_load(self._own_inverse, state.inverse_mass)
+        take_off_load(self._own_inverse, state.inverse_mass, state.carried)
 
 
 @kernel
@@ -288,6 +288,7 @@ def put_on_load(
     dt: ti.f32,
     inverse_mass: Floats,
     own_inverse: Floats,
+    carried: Floats,
     velocity: Vectors,
 ):
     """v_n += J_n/(m_n + m_load), less what gravity would do to the load, with the mass of both from then on."""
@@ -298,10 +299,12 @@ def put_on_load(
             with_load = w_n / (1.0 + mass[n] * w_n)
             velocity[n] += with_load * (impulse[n] - dt * mass[n] * gravity)
             inverse_mass[n] = with_load
+            carried[n] += mass[n]
 
 
 @kernel
-def take_off_load(own_inverse: Floats, inverse_mass: Floats):
+def take_off_load(own_inverse: Floats, inverse_mass: Floats, carried: Floats):
     """The masses that nodes had before."""
     for n in range(inverse_mass.shape[0]):
         inverse_mass[n] = own_inverse[n]
+        carried[n] = 0.0

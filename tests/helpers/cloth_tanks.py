@@ -27,6 +27,7 @@ class ClothTank(CoupledSteps):
         solver: str = "wcsph",
         gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
         water_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        force: tuple[Mapping[str, object], ...] = (),
         **fluid: object,
     ) -> None:
         low, high = np.array(water)
@@ -38,6 +39,7 @@ class ClothTank(CoupledSteps):
         scene = {
             "gravity": gravity,
             "domain": domain,
+            "force": force,
             "fluid": [{"name": "water", "solver": solver, "particle_radius": SPACING / 2, "block": [block], **fluid}],
             "cloth": [{"name": "sheet", "air_density": 0.0, "self_collision": False, **cloth}],
         }

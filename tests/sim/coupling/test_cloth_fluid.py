@@ -33,6 +33,28 @@ def test_a_drop_that_hits_a_free_sheet_keeps_momentum(taichi_cpu, solver):
     assert np.abs(tank.momentum() - before).max() < 1.0e-5 * np.linalg.norm(before)
 
 
+def test_a_force_accelerates_the_water_that_a_sheet_takes_along_once(taichi_cpu):
+    acceleration, time_s = np.array([0.0, 20.0, -40.0]), 0.05
+    tank = ClothTank(
+        cloth={"shape": rectangle(0.2, 9), "mass_per_area": 0.2},
+        water=((-0.05, -0.05, 0.03), (0.05, 0.05, 0.11)),
+        water_velocity=(0.0, 0.0, -1.5),
+        domain=OPEN_SPACE,
+        gravity=WEIGHTLESS,
+        force=({"type": "gravity", "acceleration": acceleration.tolist()},),
+        solver="dfsph",
+        wall_friction=2.0,
+    )
+    _, _, mass = tank.nodes()
+    before, total = tank.momentum(), mass.sum() + tank.fluid.diagnostics()["mass"]
+    time_s = tank.run(time_s)
+    _, after, _ = tank.nodes()
+    # The drop has come to the sheet: it moves farther than the force alone would take it.
+    assert mass @ after[:, 2] < 1.2 * mass.sum() * acceleration[2] * time_s
+    gained = total * time_s * acceleration
+    np.testing.assert_allclose(tank.momentum() - before, gained, atol=2.0e-4 * np.linalg.norm(gained))
+
+
 def sheet_in_a_shaft(solver: str, bottom: float, top: float, pin: tuple[dict[str, object], ...] = EDGES) -> ClothTank:
     """A sheet stretched from wall to wall, 10 cm above the floor, and a block of water above it from wall to wall."""
     return ClothTank(
