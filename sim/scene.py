@@ -11,7 +11,7 @@ from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
 from sim.embers.parameters import EmberParameters
 from sim.fluid.parameters import FluidParameters, dye_conflict
-from sim.forces.parameters import MOST_FORCES, AirForce, Force, unknown_targets
+from sim.forces.parameters import MOST_FORCES, Force, unknown_targets
 from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters
 from sim.rigid.parameters import RigidBodyParameters
@@ -85,8 +85,7 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_soft_matter_beside_cloth(self) -> Self:
-        """Fluid has room for one kind of sheets, samples of soft matter or of cloth; and what goes along with cloth
-        has felt forces already."""
+        """Fluid has room for one kind of sheets, samples of soft matter or of cloth."""
         if self.soft and self.cloth and self.fluid:
             raise KeyRefusedError(
                 ("soft", 0),
@@ -99,15 +98,6 @@ class SceneParameters(Parameters):
                     ("cloth", number, "integrator"),
                     '"explicit" takes thousands of substeps a frame, which soft matter would have to share; '
                     'use "xpbd", or remove the soft matter',
-                )
-        cloths = {cloth.name for cloth in self.cloth}
-        for number, force in enumerate(self.force):
-            is_felt = not isinstance(force, AirForce) and (not force.only or bool(cloths & {*force.only}))
-            if self.soft and cloths and is_felt:
-                raise KeyRefusedError(
-                    ("force", number, "only"),
-                    f'"{force.type}" acts on cloth in a job with soft matter, which would feel it twice where it '
-                    "touches; name only other bodies, or change the job's own gravity",
                 )
         return self
 
