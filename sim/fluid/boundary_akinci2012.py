@@ -5,9 +5,9 @@ A sample b stands for the volume V_b = gamma / sum_k W_bk, the sum over the samp
 the samples belong together: with both, one layer of samples has the density and the push of a half-space of fluid
 (`sim.fluid.kernels.wall_calibration`). In the fluid's density a sample counts as Psi_b = rho0 V_b (eq. 5).
 
-A support wider than usual takes two layers, each with its own factor and distance (`sim.fluid.kernels.wall_layers`).
-Bodies too thin for the second one keep to one layer, whose push alone lets nothing pass. Where walls of the domain
-meet, volumes multiply (`domain_wall_samples`).
+A support wider than usual takes two layers, each with its own factor and distance (`sim.fluid.kernels.wall_layers`),
+and volumes that multiply where walls meet (`domain_wall_samples`). Bodies too thin for the second one keep to one
+layer, whose push alone lets nothing pass.
 """
 
 from __future__ import annotations
@@ -15,30 +15,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.kernels import (
-    SUPPORT_IN_SPACINGS,
-    evaluate,
-    lattice_offsets,
-    layer_field,
-    particle_volume,
-    wall_calibration,
-    wall_layers,
-)
+from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, layer_field, particle_volume, wall_calibration, wall_layers
 from sim.shapes.solid import SignedDistance, outward_normals
 
 if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
-BEYOND_EDGE = 0.5  # weight of the row of a wall beyond an edge: with it walls bear nothing of the weight of a column
 DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
+FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
 @dataclass(frozen=True)
@@ -114,33 +105,27 @@ class BoundarySamples:
 def domain_wall_samples(
     domain: DomainParameters, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS
 ) -> BoundarySamples:
-    """Samples of the domain's closed faces: a lattice 0.95 spacings outside of each face, or two at a wide support.
+    """Samples of the domain's closed faces: a lattice 0.95 spacings outside of each face.
 
-    They are the products of three lines, one along each axis: points like a lattice of fluid within the domain, and at
+    Neighbouring walls share their edges and corners, and every sample lies there once. A wall reaches one layer
+    beyond an open face, so that fluid that runs along it is held until it has left.
+
+    With a support wider than usual a wall has two layers, and their sums reach far around edges. There the samples
+    are the products of three lines, one along each axis: points like a lattice of fluid within the domain, and at
     either end one for each layer of the wall, which weighs as much as a sample of the layer. As the kernel is nearly
-    such a product too, fluid has the density in edges and corners that it has inside, to 0.3 % at the usual support
-    and 1.5 % at wider ones. A wall reaches one layer beyond an open face, or half of a wide support, so that fluid that
-    runs along it is held until it has left.
-
-    At the usual support no fluid at rest feels where two walls meet, so walls end beyond each other instead, a row
-    outside of the domain (`_wall_line`).
+    such a product too, fluid has the density in corners that it has inside, to 1.5 %.
     """
-    is_usual = support_in_spacings == SUPPORT_IN_SPACINGS
-    lines = (_wall_line(domain, axis, spacing, support_in_spacings) for axis in range(3))
-    insides, walls = zip(*lines, strict=True)
-    points, weights = [np.empty((0, 3))], [np.empty(0)]
-    # Walls across x with all of y and z; then those across y, and across z, that are not among them.
-    for across in range(3):
-        chosen = [insides[a] if a < across or is_usual else np.concatenate([insides[a], walls[a]]) for a in range(3)]
-        chosen[across] = walls[across]
-        points.append(np.stack(np.meshgrid(*(c[:, 0] for c in chosen), indexing="ij"), axis=-1).reshape(-1, 3))
-        products = np.meshgrid(*(c[:, 1] for c in chosen), indexing="ij")
-        weights.append((products[0] * products[1] * products[2]).ravel())
-    positions, weight = np.concatenate(points), np.concatenate(weights)
-    outside = np.maximum(np.maximum(domain.min - positions, positions - domain.max), 0.0)
-    near = np.linalg.norm(outside, axis=1) < support_in_spacings * spacing
-    known = weight[near] * particle_volume(spacing, support_in_spacings)
-    return BoundarySamples.of_points(positions[near], known=known)
+    if len(wall_layers(support_in_spacings)) > 1:
+        return _product_wall_samples(domain, spacing, support_in_spacings)
+    depth = (wall_calibration(support_in_spacings).standoff_in_spacings - 0.5) * spacing
+    low, high = np.array(domain.min) - depth, np.array(domain.max) + depth
+    # Whole numbers of intervals, so the lattice meets both ends; the sample volumes even out the small stretch.
+    intervals = np.maximum(np.round((high - low) / spacing), 1).astype(int)
+    axes = [np.linspace(low[axis], high[axis], intervals[axis] + 1) for axis in range(3)]
+    faces = [_face_indices(face, intervals) for face in FACES if face not in domain.open_faces]
+    indices = np.unique(np.concatenate([np.empty((0, 3), dtype=int), *faces]), axis=0)
+    samples = np.stack([axes[axis][indices[:, axis]] for axis in range(3)], axis=1)
+    return BoundarySamples.of_points(samples)
 
 
 def sink_samples(
@@ -209,49 +194,51 @@ def _weakened(standoff: NDArray[np.float64], wanted_standoff: float, support_in_
     return fields[-1] / np.interp(standoff, distances, fields)
 
 
+def _product_wall_samples(domain: DomainParameters, spacing: float, support_in_spacings: float) -> BoundarySamples:
+    lines = (_wall_line(domain, axis, spacing, support_in_spacings) for axis in range(3))
+    insides, walls = zip(*lines, strict=True)
+    points, weights = [np.empty((0, 3))], [np.empty(0)]
+    # Walls across x with all of y and z; then those across y, and across z, that are not among them.
+    for across in range(3):
+        chosen = [insides[a] if a < across else np.concatenate([insides[a], walls[a]]) for a in range(3)]
+        chosen[across] = walls[across]
+        points.append(np.stack(np.meshgrid(*(c[:, 0] for c in chosen), indexing="ij"), axis=-1).reshape(-1, 3))
+        products = np.meshgrid(*(c[:, 1] for c in chosen), indexing="ij")
+        weights.append((products[0] * products[1] * products[2]).ravel())
+    positions, weight = np.concatenate(points), np.concatenate(weights)
+    outside = np.maximum(np.maximum(domain.min - positions, positions - domain.max), 0.0)
+    near = np.linalg.norm(outside, axis=1) < support_in_spacings * spacing
+    known = weight[near] * particle_volume(spacing, support_in_spacings)
+    return BoundarySamples.of_points(positions[near], known=known)
+
+
 def _wall_line(
     domain: DomainParameters, axis: int, spacing: float, support_in_spacings: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coordinates along an axis [m] with their weights in particles [-]: of fluid, and of the walls across it, (n, 2).
 
-    Beyond an open face the fluid's points go on for half of the support. At the usual support they go on for one beyond
-    a closed face as well, and the last one before it weighs less (`edge_row`): a wall that ended at the other one would
-    push what lies there along itself, into the other.
+    Beyond an open face the fluid's points go on for half of the support.
     """
     low, high = domain.min[axis], domain.max[axis]
     count = max(round((high - low) / spacing), 1)
     stretched = (high - low) / count
-    is_open = [f"{'xyz'[axis]}{side}" in domain.open_faces for side in "-+"]
-    is_usual = support_in_spacings == SUPPORT_IN_SPACINGS
-    beyond = [math.ceil(0.5 * support_in_spacings) if each or is_usual else 0 for each in is_open]
+    beyond = [
+        math.ceil(0.5 * support_in_spacings) if f"{'xyz'[axis]}{side}" in domain.open_faces else 0 for side in "-+"
+    ]
     inside = low + stretched * (np.arange(-beyond[0], count + beyond[1]) + 0.5)
-    weights = np.full(len(inside), stretched / spacing)
-    for row, closed in ((0, not is_open[0]), (-1, not is_open[1])):
-        if is_usual and closed:
-            weights[row] *= BEYOND_EDGE
-            weights[row + 1 if row == 0 else row - 1] *= edge_row()
     walls = [
         (end + sign * (layer.standoff_in_spacings - 0.5) * spacing, layer.volume_in_particles)
-        for end, sign, opened in ((low, -1.0, is_open[0]), (high, 1.0, is_open[1]))
-        if not opened
+        for end, sign, open_layers in ((low, -1.0, beyond[0]), (high, 1.0, beyond[1]))
+        if not open_layers
         for layer in wall_layers(support_in_spacings)
     ]
+    weights = np.full(len(inside), stretched / spacing)
     return np.stack([inside, weights], axis=1), np.array(walls).reshape(-1, 2)
 
 
-@cache
-def edge_row() -> float:
-    """Weight of a wall's row of samples next to an edge with which a lattice is as dense there as in a face [-].
-
-    The row beyond the edge weighs `BEYOND_EDGE`, and the one on its other side 1.
-    """
-    (layer,) = wall_layers()
-    offsets = lattice_offsets()
-    # An edge lacks a quarter of the fluid that a face has, and has another wall; both walls lack a part of two rows.
-    beyond = offsets[(offsets[:, 0] >= 0.0) & (offsets[:, 1] < 0.0)]
-    lacking = float(evaluate(np.linalg.norm(beyond, axis=1), SUPPORT_IN_SPACINGS).sum())
-    in_wall = offsets[offsets[:, 0] == 0.0]
-    distances = np.hypot(np.linalg.norm(in_wall, axis=1), layer.standoff_in_spacings)
-    wall = layer.volume_in_particles * evaluate(distances, SUPPORT_IN_SPACINGS)
-    own, outer = (float(wall[in_wall[:, 1] == row].sum()) for row in (0.0, -1.0))
-    return float(1.0 - (wall.sum() - lacking - 2.0 * (1.0 - BEYOND_EDGE) * outer) / (2.0 * own))
+def _face_indices(face: str, intervals: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Lattice indices of one face of a box of so many intervals, (m, 3)."""
+    ranges = [np.arange(count + 1) for count in intervals]
+    normal = "xyz".index(face[0])
+    ranges[normal] = ranges[normal][:1] if face[1] == "-" else ranges[normal][-1:]
+    return np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)
