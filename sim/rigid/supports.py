@@ -56,6 +56,8 @@ def friction_pyramid(normal: Array, force: Array, friction: Array) -> tuple[Arra
 def least_shares(supports: Supports, curvature: Array, slope: Array, size: float) -> Array:
     """What each support carries if the body has the least energy [N], (k,).
 
+    That of the solver of contacts where the search does not end, which is a share as good for how the body moves.
+
     Args:
         supports: they.
         curvature: second derivatives of the energy by what they carry, (k, k).
@@ -75,6 +77,9 @@ def least_shares(supports: Supports, curvature: Array, slope: Array, size: float
         own = EXACT * (wrench * (supports.other == other)[:, None]).T
         rows.append(own)
         wanted.append(own @ supports.carried / total)
-    found, _ = nnls(np.concatenate(rows), np.concatenate(wanted), maxiter=MOST_TURNS * len(slope))
+    try:
+        found, _ = nnls(np.concatenate(rows), np.concatenate(wanted), maxiter=MOST_TURNS * len(slope))
+    except RuntimeError:
+        return supports.carried
     shares: Array = total * found
     return shares
