@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
-BEYOND_EDGE = 0.5  # weight of the row of a wall beyond an edge: with it walls bear nothing of the weight of a column
+BEYOND_EDGE = 1.0  # weight of the row of a wall beyond an edge: with it walls bear nothing of the weight of a column
 DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
 
 
