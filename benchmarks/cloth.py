@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -301,6 +302,7 @@ def print_figures(arguments: argparse.Namespace) -> None:
         )
     if device != "cpu":
         return
+    # The last scene again, in Blender.
     blender = measure_blender(nodes, frames, min(arguments.from_frame, frames) - 1)
     over, spent = blender["frame_ms"]["median"], blender["frame_processor_ms"]["median"]
     print(f"| Blender, the last again | {over:.0f}, {over / wall['median']:.1f} times | ", end="")
@@ -333,6 +335,8 @@ def main() -> dict[str, Any] | None:
     parser.add_argument("--blender", action="store_true", help="also Blender's own cloth")
     parser.add_argument("--as-blender", action="store_true", help="Blender's own cloth alone, and where it lies")
     asked, _ = parser.parse_known_args()
+    if asked.figures and (asked.blender or "--nodes" in sys.argv or "--scene" in sys.argv):
+        parser.error("--figures has scenes of its own; leave out --scene, --nodes and --blender")
     if asked.as_blender:
         return drop_in_blender(asked.nodes[0], asked.frames)
     arguments = start_taichi(parser)

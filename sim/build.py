@@ -98,8 +98,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     fluids = [_build_fluids(scene, *around, forces)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, static, forces, frames_per_second) for smoke in scene.smoke]
     coupled: list[Solver] = [*fluids, *softs, *cloths, *([] if rigid is None else [rigid]), *smokes]
-    couplings: list[Coupling] = [SoftClothCoupling(soft, cloth) for soft in softs for cloth in cloths]
-    couplings += [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
+    couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
         names = [body.name for kind in (True, False) for body in scene.rigid if (body.kind != "static") == kind]
         passing = passing_of(scene.joint, scene.cloth, names)
@@ -109,6 +108,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         if rigid is not None and nodes is not None:
             couplings.append(ClothJointsCoupling(cloth, rigid, nodes, passing))
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
+        couplings += [SoftClothCoupling(soft, cloth) for soft in softs]
     for soft in softs:
         couplings += [SoftFluidCoupling(fluid, soft) for fluid in fluids]
         soft.contacts = contacts_of_soft(soft, scene.rigid, rigid, static, mass=soft.mass + _most_mass(fluids))

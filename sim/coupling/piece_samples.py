@@ -16,7 +16,8 @@ from sim.shapes.placement import PlacedSolid
 from sim.shapes.sampling import sample_surface
 from sim.shapes.solid import SignedDistance
 
-COVERED = 1.0e-3  # depth from which on a sample is inside of what its piece is glued to [spacings]
+COVERED = 0.1  # depth from which on a sample is covered [spacings]: facets of what is round lie inside of it
+SHARD = 0.1  # spacing of what the sample of a shard is chosen of [spacings]
 
 Float64Array = NDArray[np.float64]
 
@@ -37,6 +38,9 @@ def samples_of_pieces(rigid: RigidSolver, spacing: float, support_in_spacings: f
         for number, (piece, part) in enumerate(zip(whole.pieces, own, strict=True)):
             inner = sample_surface(part.rest_mesh(), spacing).astype(np.float64)
             inner = inner[solid.signed_distance(inner) < -COVERED * spacing]
+            if not len(inner) and not (nearest == number).any():  # a shard, which is felt by one sample at least
+                finer = sample_surface(part.rest_mesh(), SHARD * spacing).astype(np.float64)
+                inner = finer[np.argsort(solid.signed_distance(finer), kind="stable")[:1]]
             points = np.concatenate([outer[nearest == number], inner]) - rigid.solids[piece].centre_of_mass
             layer = np.repeat(np.arange(layers), len(points))
             found[int(piece)] = BoundarySamples.of_points(np.tile(points, (layers, 1)), factor=0.0, layer=layer)

@@ -12,7 +12,7 @@ has v' + w then. A part that leads away from the sheet goes on as it is. So line
 light the sheet is, and what lies on one side knows nothing of what lies on the other.
 
 No particle passes: it is held a little off the plane of its nearest triangle, and put back where its way and that of a
-triangle have crossed.
+triangle have crossed. What sheets or walls leave no room for may pass in the end, and is counted.
 """
 
 import math
@@ -26,6 +26,7 @@ from sim.cloth.proximity import closest_on_triangle, distance_to_triangle, unit_
 from sim.cloth.solver import ClothSolver
 from sim.cloth.state import NodeLoad
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors, on_device
+from sim.core.box import Box
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
@@ -41,10 +42,11 @@ ON_SHEET = 1.0e-3  # distance from a sheet below which a node is on neither side
 LEAST_GAP = 0.02  # of a particle and a sheet [cells]
 CROSSED = 1.0e-3  # distance from a triangle below which a way has crossed it [cells]
 STEEPEST = 0.7  # cosine of the angle to a rim's normal within which a particle is over the sheet
+FALSE_POSITIONS = 6  # steps towards when a particle crosses a triangle
 MOST_ROUNDS = 4  # of putting particles back in a step
 LOOSE = 1.0 + 1.0e-4  # factor on a distance that must not be too small by rounding
 TERMS = 4  # of a node's sums: mass and impulse
-FRACTIONS = 2.0**30  # steps of what keys compare, in a range of 1
+FRACTIONS = 2.0**29  # steps of what keys compare, in a range of 1
 
 Corners = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
 
@@ -138,11 +140,15 @@ class SoftClothCoupling(Coupling):
         self._soft.end_substep(dt)
         place_nodes(state.position, state.carry, self._sheets.place)
         gap = LEAST_GAP * blocks.edge
-        hold_off(particles, self._sheets, self._met, gap)
-        for _ in range(MOST_ROUNDS):
-            if find_crossings(blocks, particles, self._sheets, self._met) == 0:
+        hold_off(particles, self._sheets, self._met, self._soft.box, gap)
+        for turn in range(MOST_ROUNDS + 1):
+            crossed = find_crossings(blocks, particles, self._sheets, self._met)
+            if crossed == 0:
                 break
-            put_back(particles, self._sheets, self._met, gap)
+            if turn == MOST_ROUNDS:
+                self._soft.passed += crossed
+            else:
+                put_back(particles, self._sheets, self._met, self._soft.box, gap)
         self._soft.placed_by_others()
         self.resume()
 
@@ -323,7 +329,7 @@ def meet(
             if share > 0.0:
                 t, weights, normal = met.triangle[p], met.weights[p], met.normal[p]
                 affine = affine_momentum(particles, p, own, pull, blocks)
-                ghost = particles.velocity[p] + affine @ arm / (share * own)
+                ghost = particles.velocity[p] + affine @ (arm / share) / own
                 sheet = mixed(t, weights, sheets, sheets.velocity)
                 relative = ghost - sheet
                 ghost += dt * gravity
@@ -367,8 +373,14 @@ def go_along(particles: Particles, sheets: Sheets, met: Met, parting: Parting):
             parting.ghost[p] += mixed(met.triangle[p], met.weights[p], sheets, sheets.velocity)
 
 
+@func
+def within(x: ti.math.vec3, box: Box) -> ti.math.vec3:
+    """The nearest point between the closed walls [m]."""
+    return ti.min(ti.max(x, box.wall_low), box.wall_high)
+
+
 @kernel
-def hold_off(particles: Particles, sheets: Sheets, met: Met, gap: ti.f32):
+def hold_off(particles: Particles, sheets: Sheets, met: Met, box: Box, gap: ti.f32):
     """Put particles at least a gap [m] before the plane at their nearest point, as that is after the step."""
     for p in range(particles.count):
         t = met.triangle[p]
@@ -378,7 +390,56 @@ def hold_off(particles: Particles, sheets: Sheets, met: Met, gap: ti.f32):
             normal = (met.normal[p] + side * (now - before)).normalized()
             off = (particles.position[p] - mixed(t, met.weights[p], sheets, sheets.place)).dot(normal)
             if off < gap:
-                particles.position[p] += (gap - off) * normal
+                particles.position[p] = within(particles.position[p] + (gap - off) * normal, box)
+
+
+@ti.func
+def volume_at(
+    at: ti.f32,
+    x: ti.math.vec3,
+    u: ti.math.vec3,
+    v: ti.math.vec3,
+    x_moved: ti.math.vec3,
+    u_moved: ti.math.vec3,
+    v_moved: ti.math.vec3,
+) -> ti.f32:
+    """Volume that a point and two sides span at a time from 0 to 1 [m³], with the sign of the point's side."""
+    return (x + at * x_moved).dot((u + at * u_moved).cross(v + at * v_moved))
+
+
+@ti.func
+def time_of_crossing(
+    x: ti.math.vec3,
+    u: ti.math.vec3,
+    v: ti.math.vec3,
+    x_moved: ti.math.vec3,
+    u_moved: ti.math.vec3,
+    v_moved: ti.math.vec3,
+) -> ti.f32:
+    """When a point is in the plane of a triangle that moves and turns, from 0 to 1: by false position, halved where one
+    end stays (the Illinois method, Dowell & Jarratt 1971).
+
+    Args:
+        x, u, v: the point and the other corners, seen from the first corner, at the start [m].
+        x_moved, u_moved, v_moved: how far each goes [m].
+    """
+    low, high = 0.0, 1.0
+    at_low = volume_at(0.0, x, u, v, x_moved, u_moved, v_moved)
+    at_high = volume_at(1.0, x, u, v, x_moved, u_moved, v_moved)
+    at = 0.5
+    for _ in range(FALSE_POSITIONS):
+        if at_low != at_high:
+            at = ti.math.clamp((low * at_high - high * at_low) / (at_high - at_low), 0.0, 1.0)
+        value = volume_at(at, x, u, v, x_moved, u_moved, v_moved)
+        if (value >= 0.0) == (at_high >= 0.0):
+            high = at
+            at_high = value
+            at_low *= 0.5
+        else:
+            low = at
+            at_low = value
+            at_high *= 0.5
+    return at
 
 
 @kernel
@@ -407,7 +468,9 @@ def find_crossings(blocks: Blocks, particles: Particles, sheets: Sheets, met: Me
                             off_before = (x_p - a).dot(before)
                             off_now = (x_p - a + (moved - a_moved)).dot(now)
                             if (off_before >= 0.0) != (off_now >= 0.0):
-                                at = off_before / (off_before - off_now)
+                                at = time_of_crossing(
+                                    x_p - a, b - a, c - a, moved - a_moved, b_moved - a_moved, c_moved - a_moved
+                                )
                                 from_a = a - x_p + at * (a_moved - moved)
                                 from_b = b - x_p + at * (b_moved - moved)
                                 from_c = c - x_p + at * (c_moved - moved)
@@ -422,7 +485,7 @@ def find_crossings(blocks: Blocks, particles: Particles, sheets: Sheets, met: Me
 
 
 @kernel
-def put_back(particles: Particles, sheets: Sheets, met: Met, gap: ti.f32):
+def put_back(particles: Particles, sheets: Sheets, met: Met, box: Box, gap: ti.f32):
     """Put particles that have crossed a triangle a gap [m] before it, on the side that they come from."""
     for p in range(particles.count):
         if met.key[p] < no_key() and particles.body[p] >= 0:
@@ -431,7 +494,7 @@ def put_back(particles: Particles, sheets: Sheets, met: Met, gap: ti.f32):
             came = (met.start[p] - sheets.before[first]).dot(normal_at(t, sheets, sheets.before))
             normal = ti.select(came >= 0.0, 1.0, -1.0) * normal_at(t, sheets, sheets.place)
             off = (particles.position[p] - sheets.place[first]).dot(normal)
-            particles.position[p] += (gap - off) * normal
+            particles.position[p] = within(particles.position[p] + (gap - off) * normal, box)
 
 
 @kernel

@@ -208,6 +208,11 @@ class FluidParameters(Parameters):
             raise ValueError("wind moves nothing without air; set air_density, 1.2 kg/m³ for air, or remove wind")
         if "contact_angle_deg" in self.model_fields_set and self.surface_tension_model != "csf":
             raise ValueError('contact_angle_deg needs surface_tension_model = "csf"; remove it or name that model')
+        if self.contact_angle_deg < SLIPPERY_ANGLE_DEG and not self.artificial_viscosity:
+            raise ValueError(
+                f"contact_angle_deg = {self.contact_angle_deg:g} is below {SLIPPERY_ANGLE_DEG:g} and needs friction of "
+                "walls, which artificial_viscosity = 0 leaves nearly none of; remove that"
+            )
         if self.contact_angle_deg < SLIPPERY_ANGLE_DEG and self.wall_friction < SPREADING_FRICTION:
             raise ValueError(
                 f"contact_angle_deg = {self.contact_angle_deg:g} is below {SLIPPERY_ANGLE_DEG:g} and needs "

@@ -435,6 +435,8 @@ class RigidSolver:
         """A frame starts at simulated time `time_s` [s]."""
         self.time_s = time_s
         self._contact_count = self._iterations = self._not_converged = 0
+        if self.glue is not None:
+            self.glue.not_shared = 0
         self._max_penetration = 0.0
         if self.joints is not None:
             self.joints.begin_frame()
@@ -630,7 +632,12 @@ class RigidSolver:
         angular = spin + np.cross(bodies.position[free], momentum)
         kinetic = 0.5 * (np.sum(momentum * bodies.velocity[free]) + np.sum(spin * bodies.angular_velocity[free]))
         of_joints = {} if self.joints is None else self.joints.diagnostics()
-        of_glue = {} if self.glue is None else {"faces_broken": float(np.count_nonzero(self.glue.is_broken))}
+        of_glue = {}
+        if self.glue is not None:
+            of_glue = {
+                "faces_broken": float(np.count_nonzero(self.glue.is_broken)),
+                "loads_not_shared": float(self.glue.not_shared),
+            }
         return {
             "mass": float(mass.sum()),
             **_by_axis("momentum", momentum.sum(axis=0)),

@@ -56,13 +56,14 @@ def friction_pyramid(normal: Array, force: Array, friction: Array) -> tuple[Arra
 def least_shares(supports: Supports, curvature: Array, slope: Array, size: float) -> Array:
     """What each support carries if the body has the least energy [N], (k,).
 
-    That of the solver of contacts where the search does not end, which is a share as good for how the body moves.
-
     Args:
         supports: they.
         curvature: second derivatives of the energy by what they carry, (k, k).
         slope: its derivatives where they carry nothing, (k,).
         size: a length of the body, by which moments are divided [m].
+
+    Raises:
+        RuntimeError: the search does not end.
     """
     total = float(supports.carried.sum())
     values, ways = np.linalg.eigh(curvature)
@@ -77,9 +78,6 @@ def least_shares(supports: Supports, curvature: Array, slope: Array, size: float
         own = EXACT * (wrench * (supports.other == other)[:, None]).T
         rows.append(own)
         wanted.append(own @ supports.carried / total)
-    try:
-        found, _ = nnls(np.concatenate(rows), np.concatenate(wanted), maxiter=MOST_TURNS * len(slope))
-    except RuntimeError:
-        return supports.carried
+    found, _ = nnls(np.concatenate(rows), np.concatenate(wanted), maxiter=MOST_TURNS * len(slope))
     shares: Array = total * found
     return shares

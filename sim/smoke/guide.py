@@ -138,6 +138,7 @@ class Guide:
         """Continue from a checkpoint of a frame's end, at a simulated time [s]. Raises ValueError: it does not fit."""
         own = {name.removeprefix("guide/"): values for name, values in arrays.items() if name.startswith("guide/")}
         self._world.restore(round(time_s / self._frame_s), own)
+        self._make_room()
         self._is_due = False
 
     def _first(self, grid: SmokeGrid) -> ti.math.ivec3:
@@ -154,6 +155,8 @@ class Guide:
         except SimulationDivergedError as error:
             finding = f"{error.quantity}, in the simulation that guides it"
             raise SimulationDivergedError(error.body, error.frame, error.time_s, finding, error.hint) from error
+        if self._grid is not self._smoke.grid:
+            raise RuntimeError("the window of a guide moved within its frame")
         self._is_due = False
         self._speed = max(_find_speeds(self._smoke.air, self._before, self._rows))
 

@@ -26,7 +26,8 @@ NODES = EDGE**3
 SUPPORT = 3  # nodes along an axis that a particle has a share in
 RING = 3  # nodes around the domain: what particles at its faces reach, and one
 GROWTH = 1.1
-MARGIN = 0.5  # how far particles may go before blocks are found anew [edges]
+MARGIN = 0.5  # how far from where blocks were found last particles still have them [edges]
+SLACK = 0.01  # of that, for the rounding of places [edges]
 MOST_BLOCKS = 2**28
 
 AROUND = tuple(itertools.product((-1.0, 1.0), repeat=3))
@@ -63,7 +64,7 @@ class BlockGrid:
 
     def __init__(self, domain: DomainParameters, edge: float, particles: int) -> None:
         low, high = np.array(domain.min), np.array(domain.max)
-        nodes = np.ceil((high - low) / edge - 1.0e-6) + 1.0 + 2.0 * RING
+        nodes = np.ceil((high - low) / edge - 1.0e-6) + 2.0 + 2.0 * RING  # one more for the margin
         shape = np.ceil(nodes / EDGE) + 1.0
         if shape.prod() > MOST_BLOCKS:
             raise ValueError(
@@ -72,6 +73,7 @@ class BlockGrid:
             )
         total = math.prod(shape.astype(int).tolist())
         self._n, self.count, self._way = particles, 0, math.inf
+        self._rounding = float(np.spacing(np.float32(max(np.abs(low).max(), np.abs(high).max()))))
         self._lattice = {
             "origin": tuple((low - RING * edge).tolist()),
             "edge": edge,
@@ -88,13 +90,13 @@ class BlockGrid:
 
         Particles of body -1 are left out.
         """
-        grown = not self._way <= MARGIN and self._find(position, body)
+        grown = not self._way <= MARGIN - SLACK and self._find(position, body)
         sort_by_cell(self.blocks, self.count, position, body, self._n)
         return grown
 
     def moved(self, way: float) -> None:
         """Take note that particles went so far at most [m]; infinite where they are others now."""
-        self._way += way / self._lattice["edge"]
+        self._way += (way + self._rounding) / self._lattice["edge"]
 
     def _find(self, position: ti.Ndarray, body: ti.Ndarray) -> bool:
         """Find the blocks that hold nodes of particles until these have gone as far as the margin."""

@@ -75,6 +75,8 @@ class SoftSolver:
         load: what touches the particles in the next step; none before `let_touch`.
         parting: the nodes that sheets hide from the particles; none before `let_part`.
         met_speed: of the fastest sheet [m/s].
+        passed: particles that went through sheets in this frame, as these or walls pressed them.
+        box: the domain, for kernels.
         masses: of a particle of each body [kg], (bodies,), on the device.
         spacing, volume: of particles at rest [m, m³].
         poured: what emitters let in.
@@ -117,11 +119,11 @@ class SoftSolver:
         self._load_particles(0)
         self._find_hidden: Callable[[Blocks, int], None] | None = None
         self._part_particles(0)
-        self.met_speed = 0.0
+        self.met_speed, self.passed = 0.0, 0
         self._laws = laws_of(self.parameters)
         self._grid = BlockGrid(domain, self.parameters[0].cell_size, n)
         self._make_nodes()
-        self._box = box_of(domain)
+        self.box = box_of(domain)
         self._forces = (forces or ForceField(())).on([(each.name,) for each in self.parameters])
         self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
         self.contacts: BodyContacts | None = None
@@ -137,7 +139,7 @@ class SoftSolver:
         self.load = Load(*arrays, there=count > 0)
 
     def let_part(self, find_hidden: Callable[[Blocks, int], None]) -> None:
-        """Have `find_hidden` find what sheets part in each substep, once particles are sorted into so many blocks.
+        """Have `find_hidden` find what sheets part in each substep, once particles are sorted into the stored blocks.
 
         Whoever couples the sheets ends each substep by `end_substep`, when it knows how they move.
         """
@@ -180,6 +182,7 @@ class SoftSolver:
         changed = SoftParameters.model_validate({**self.parameters[number].model_dump(exclude_unset=True), **changes})
         self.parameters = (*self.parameters[:number], changed, *self.parameters[number + 1 :])
         self._laws = laws_of(self.parameters)
+        self._measure()
 
     # --- the step ---------------------------------------------------------------------------------------------------
 
@@ -214,20 +217,22 @@ class SoftSolver:
         )
         if self.contacts is not None:
             self.contacts.resolve(blocks, stored, self._nodes, dt)
-        stop_at_walls(blocks, stored, self._nodes, self._box, self.parameters[0].friction)
+        stop_at_walls(blocks, stored, self._nodes, self.box, self.parameters[0].friction)
         if self._find_hidden is None:
             self.end_substep(dt)
 
     def end_substep(self, dt: float) -> None:
         """Take velocities back from the nodes, and move for dt [s]."""
-        grid, given = self._grid, (self._laws, self._nodes, self.parting, self._box)
+        grid, given = self._grid, (self._laws, self._nodes, self.parting, self.box)
         grid_to_particles(grid.blocks, grid.count, self.particles, *given, dt)
         self._measure()
         grid.moved(dt * self._speed)
 
     def begin_frame(self, time_s: float) -> None:
-        """Emitters go by the time of the frame."""
+        """Emitters go by the time of the frame; blocks are found anew, as after a restart."""
         self._time_s = time_s
+        self._grid.moved(math.inf)
+        self.passed = 0
 
     # --- what others ask --------------------------------------------------------------------------------------------
 
@@ -294,6 +299,7 @@ class SoftSolver:
         return {
             "particle_count": float(inside.sum()),
             "particles_left": float((body == -1).sum()),
+            "particles_through_cloth": float(self.passed),
             "mass": float(mass.sum()),
             "max_speed": self._speed,
             "kinetic_energy": float(0.5 * mass @ (velocity**2).sum(axis=1)),

@@ -267,6 +267,8 @@ def grid_to_particles(
         keep_symmetric(particles.stress, p, particles.count, stress)
         particles.history[p] = history
         moved = ti.min(ti.max(x + dt * velocity, box.wall_low), box.wall_high)
+        if not (is_finite(velocity[0]) & is_finite(velocity[1]) & is_finite(velocity[2])):
+            moved = x  # and is found by `measure`
         particles.position[p] = moved
         if (moved < box.keep_low).any() or (moved > box.keep_high).any():
             particles.body[p] = -1

@@ -40,9 +40,16 @@ def test_a_glued_cube_sinks_as_the_same_cube_in_one_piece(taichi_cpu):
     np.testing.assert_allclose(mover.angular_velocity[0], body.angular_velocity[0], atol=1.0e-3 * speed / SPACING)
 
 
-@pytest.mark.parametrize("support", [2.0, 3.0])
-def test_what_holds_has_the_samples_of_the_whole(taichi_cpu, support):
-    body = {"kind": "dynamic", "density": 1000.0, "shape": {"type": "cylinder", "radius": 0.06, "height": 0.2}}
+@pytest.mark.parametrize(
+    ("shape", "support"),
+    [
+        ({"type": "cylinder", "radius": 0.06, "height": 0.2}, 2.0),
+        ({"type": "cylinder", "radius": 0.06, "height": 0.2}, 3.0),
+        ({"type": "sphere", "radius": 0.1}, 2.0),
+    ],
+)
+def test_what_holds_has_the_samples_of_the_whole(taichi_cpu, shape, support):
+    body = {"kind": "dynamic", "density": 1000.0, "shape": shape}
     body |= {"position": (0.01, 0.0, 0.16), "rotation_deg": (30.0, 10.0, 0.0)}
     water = ((-0.11, -0.11, 0.0), (0.11, 0.11, 0.02))
     wholes = [body, {**body, "breaks": {"strength": 1.0e9, "pieces": 5}}]

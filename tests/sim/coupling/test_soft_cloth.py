@@ -202,13 +202,34 @@ def test_what_has_crossed_a_triangle_is_put_back_to_its_side():
     thrown[falls, 2] -= 0.02
     particles.position.from_numpy(thrown)
     assert find_crossings(blocks, particles, sheets, met) == falls.sum() + is_hit.sum() > 20
-    put_back(particles, sheets, met, 1.0e-4)
+    put_back(particles, sheets, met, coupling._soft.box, 1.0e-4)
     now = particles.position.to_numpy()
     np.testing.assert_allclose(now[falls, 2], 1.0e-4, atol=1.0e-6)
     np.testing.assert_allclose(now[is_hit, 2], 0.0121, atol=1.0e-6)
     others = ~(falls | is_hit)
     np.testing.assert_array_equal(now[others], thrown[others])
     assert find_crossings(blocks, particles, sheets, met) == 0
+
+
+def test_a_sheet_that_turns_about_a_line_meets_all_that_it_sweeps_over():
+    """Half of a sheet folds up by 30 degrees; how far particles are from planes does not change evenly meanwhile."""
+    world = world_of(
+        **SPACE,
+        soft=[matter(box((0.16, 0.12, 0.1), (0.0, 0.0, 0.052)))],
+        cloth=[sheet(0.2, 5, pin=EVERYWHERE)],
+    )
+    world.advance_frame()
+    coupling = next(each for each in world._couplings if isinstance(each, SoftClothCoupling))
+    particles, sheets, met, blocks = coupling._soft.particles, coupling._sheets, coupling._met, coupling._blocks
+    coupling._find_hidden(blocks, coupling._stored)
+    nodes = sheets.before.to_numpy().astype(np.float64)
+    slope, rises = np.radians(30.0), nodes[:, 0] > 0.0
+    turned = nodes.copy()
+    turned[rises, 0], turned[rises, 2] = nodes[rises, 0] * np.cos(slope), nodes[rises, 0] * np.sin(slope)
+    sheets.place.from_numpy(turned.astype(np.float32))
+    x, _, z = particles.position.to_numpy().astype(np.float64).T
+    swept = (x > 0.002) & (x < 0.1 * np.cos(slope) - 0.002) & (z < x * np.tan(slope) - 1.0e-4)
+    assert find_crossings(blocks, particles, sheets, met) == swept.sum() > 20
 
 
 def run_in_hammock(checkpoint: str, resume: bool) -> str:

@@ -339,6 +339,10 @@ def test_at_the_scale_of_a_glass_water_has_its_tension_unless_the_job_says_other
         ({"adhesion": 1.0}, 'adhesion is now contact_angle_deg, with surface_tension_model = "csf"'),
         ({"surface_tension_model": "csf", "contact_angle_deg": 20.0}, "greater than or equal to 30"),
         ({**CSF, "contact_angle_deg": 40.0, "wall_friction": 4.0}, "needs wall_friction = 5 or more, not 4"),
+        (
+            {**CSF, "contact_angle_deg": 40.0, "wall_friction": 9.0, "artificial_viscosity": 0.0},
+            "friction of walls, which artificial_viscosity = 0 leaves nearly none of",
+        ),
         ({"surface_tension_model": "csf", "support_in_spacings": 3.0}, "needs support_in_spacings = 2"),
         ({"surface_tension_model": "akinci2013"}, '"akinci2013" is now "csf"'),
     ],

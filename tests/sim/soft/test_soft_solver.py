@@ -201,6 +201,20 @@ def test_a_checkpoint_of_another_body_is_refused():
         solver.restore(other.checkpoint())
 
 
+def test_what_is_not_a_number_is_told_and_stays_where_it_is():
+    """Far from the corner of the domain that clamping would bring it to, and from all stored blocks there."""
+    solver = SoftSolver([soft(position=(0.3, 0.3, 0.3), size=(0.1, 0.1, 0.1))], domain=DOMAIN, gravity=FREE)
+    for _ in range(3):
+        solver.substep(solver.stable_dt())
+    stress = solver.particles.stress.to_numpy()
+    stress[0] = np.nan
+    solver.particles.stress.from_numpy(stress)
+    for _ in range(10):
+        solver.substep(solver.stable_dt())
+    assert "not finite" in solver.first_bad_quantity()
+    assert solver.view("it")["position"].min() > 0.2
+
+
 def test_blocks_that_are_kept_while_particles_go_half_a_cell_give_the_bits_of_blocks_found_in_each_step(monkeypatch):
     found = []
     for margin in (blocks.MARGIN, 0.0):
