@@ -123,8 +123,8 @@ def test_a_chain_pulls_at_cloth_as_its_weight_at_a_node_would():
 def test_heavy_links_on_light_cloth_gain_no_energy():
     """Hung at two corners: 2 kg of chain on 18 g of cloth, which throws it up again.
 
-    Within 4 % of what the sheet stores, 2 to 3 % as the end swings: it alone, with that mass at a node, is as far off at
-    60 substeps a frame.
+    Within 4 % of what the sheet stores, 2 to 3 % as the end swings: it alone, with that mass at a node, is as far off
+    at 60 substeps a frame.
     """
     banner = sheet(rotation_deg=(90.0, 0.0, 0.0), pin=CORNERS[2:])
     world = hanging(at=(0.0, 0.0, TOP - 0.15), cloth=banner)
