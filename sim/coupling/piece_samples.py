@@ -60,10 +60,14 @@ class PieceSamples:
         self._whole_of = {int(piece): whole for whole in glue.wholes for piece in whole.pieces}
         self._known: dict[tuple[int, ...], tuple[NDArray[np.int64], Float64Array, Float64Array]] = {}
         self._surface = boundary.moving.positions.astype(np.float64)  # about the centre of each body
+        self._leader = np.empty(0, dtype=glue.leader.dtype)  # as the samples have it
 
     def follow(self) -> None:
         """Let pieces move with what they are glued to, and feel the fluid where they are free."""
         glue = self._glue
+        if np.array_equal(glue.leader, self._leader):
+            return
+        self._leader = glue.leader.copy()
         leaders = np.unique(glue.leader[list(self._whole_of)])
         components = [tuple(map(int, np.flatnonzero(glue.leader == leader))) for leader in leaders]
         self._known = {each: self._known[each] if each in self._known else self._made(each) for each in components}

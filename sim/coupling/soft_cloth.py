@@ -117,9 +117,9 @@ class SoftClothCoupling(Coupling):
         soft.let_part(self._find_hidden)
         self.resume()
 
-    def _find_hidden(self, blocks: Blocks, stored: int) -> None:
+    def _find_hidden(self, blocks: Blocks) -> None:
         """Find the nodes behind sheets."""
-        self._blocks, self._stored = blocks, stored
+        self._blocks = blocks
         particles, met, state = self._soft.particles, self._met, self._cloth.state
         place_nodes(state.position, state.carry, self._sheets.before)
         find_nearest(blocks, particles, self._sheets, met, REACH * blocks.edge)
@@ -206,16 +206,13 @@ def place_nodes(position: Vectors, carry: Vectors, place: Vectors):
 
 
 @func
-def cells_around(t: ti.i32, sheets: Sheets, reach: ti.f32, blocks: Blocks, least: ti.template()) -> Triple:
-    """Lowest or highest cell that may hold particles within reach of a triangle at the start of a step."""
+def cells_around(t: ti.i32, sheets: Sheets, reach: ti.f32, blocks: Blocks):
+    """Lowest and highest cell that may hold particles within reach of a triangle at the start of a step."""
     n = sheets.corners[t]
     a, b, c = sheets.before[n[0]], sheets.before[n[1]], sheets.before[n[2]]
-    corner = Triple(0)
-    if ti.static(least):
-        corner = base_of(ti.min(a, ti.min(b, c)) - reach, blocks)
-    else:
-        corner = base_of(ti.max(a, ti.max(b, c)) + reach, blocks)
-    return ti.max(0, ti.min(corner, EDGE * blocks.shape - 1))
+    low, high = base_of(ti.min(a, ti.min(b, c)) - reach, blocks), base_of(ti.max(a, ti.max(b, c)) + reach, blocks)
+    last = EDGE * blocks.shape - 1
+    return ti.max(0, ti.min(low, last)), ti.max(0, ti.min(high, last))
 
 
 @func
@@ -244,10 +241,7 @@ def find_nearest(blocks: Blocks, particles: Particles, sheets: Sheets, met: Met,
         n = sheets.corners[t]
         a, b, c = sheets.before[n[0]], sheets.before[n[1]], sheets.before[n[2]]
         lower, upper = ti.min(a, ti.min(b, c)), ti.max(a, ti.max(b, c))
-        low, high = (
-            cells_around(t, sheets, reach, blocks, True),
-            cells_around(t, sheets, reach, blocks, False),
-        )
+        low, high = cells_around(t, sheets, reach, blocks)
         for z in range(low[2], high[2] + 1):
             for y in range(low[1], high[1] + 1):
                 for x in range(low[0], high[0] + 1):
@@ -452,10 +446,7 @@ def find_crossings(blocks: Blocks, particles: Particles, sheets: Sheets, met: Me
         a, b, c = sheets.before[n[0]], sheets.before[n[1]], sheets.before[n[2]]
         a_moved, b_moved, c_moved = sheets.place[n[0]] - a, sheets.place[n[1]] - b, sheets.place[n[2]] - c
         before, now = normal_at(t, sheets, sheets.before), normal_at(t, sheets, sheets.place)
-        low, high = (
-            cells_around(t, sheets, NEAR * blocks.edge, blocks, True),
-            cells_around(t, sheets, NEAR * blocks.edge, blocks, False),
-        )
+        low, high = cells_around(t, sheets, NEAR * blocks.edge, blocks)
         for z in range(low[2], high[2] + 1):
             for y in range(low[1], high[1] + 1):
                 for x in range(low[0], high[0] + 1):

@@ -108,7 +108,7 @@ class Guide:
     def correlation(self, air: Air, grid: SmokeGrid) -> float:
         """Correlation of a fine smoke's velocity, on the guide's faces, with the guide's at the end of the frame [-].
 
-        Of all guided faces off the mean of each component; 1 where both are at rest.
+        Of all guided faces but the last ones along each axis, off the mean of each component; 1 where both are at rest.
         """
         coarse = self._smoke.air
         given = self._before, self._missing, self._first(grid), self._refinement, 1.0

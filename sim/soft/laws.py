@@ -39,8 +39,7 @@ class Laws(NamedTuple):
     slope: Floats  # SAND: of the cone, |s| over 3 p, sqrt(2)/3 tan(phi) [-]
     tip: Floats  # SAND: Hencky strain of volume that cohesion bears [-]
     yielding: Floats  # CLAY: norm of the deviatoric Hencky strain at which it yields [-]
-    flowing: Floats  # CLAY: its deviator beyond that, d, decays as d' = -d^power/flowing; sqrt(2)^(1 - power)
-    # (K/mu)^power [s]
+    flowing: Floats  # CLAY: sqrt(2)^(1 - power) (K/mu)^power [s]; what is beyond, d, decays as d' = -d^power/flowing
     power: Floats  # CLAY: 1 over Herschel and Bulkley's exponent, 1 or more [-]
     least: Floats  # SNOW: least and largest stretch [-]
     most: Floats

@@ -117,7 +117,7 @@ class SoftSolver:
         self.spacing = self.parameters[0].spacing
         self.masses, self.volume = on_device(particle_mass), volume
         self._load_particles(0)
-        self._find_hidden: Callable[[Blocks, int], None] | None = None
+        self._find_hidden: Callable[[Blocks], None] | None = None
         self._part_particles(0)
         self.met_speed, self.passed = 0.0, 0
         self._laws = laws_of(self.parameters)
@@ -138,7 +138,7 @@ class SoftSolver:
         arrays = ti.ndarray(ti.f32, max(count, 1)), ti.Vector.ndarray(3, ti.f32, max(count, 1))
         self.load = Load(*arrays, there=count > 0)
 
-    def let_part(self, find_hidden: Callable[[Blocks, int], None]) -> None:
+    def let_part(self, find_hidden: Callable[[Blocks], None]) -> None:
         """Have `find_hidden` find what sheets part in each substep, once particles are sorted into the stored blocks.
 
         Whoever couples the sheets ends each substep by `end_substep`, when it knows how they move.
@@ -210,7 +210,7 @@ class SoftSolver:
             self._make_nodes()
         blocks, stored = grid.blocks, grid.count
         if self._find_hidden is not None:
-            self._find_hidden(blocks, stored)
+            self._find_hidden(blocks)
         touching = self.masses, self.volume, self.load, self.parting
         particles_to_grid(
             blocks, stored, particles, *touching, self._shares, self._nodes, ti.math.vec3(self.gravity), dt

@@ -123,7 +123,7 @@ def test_a_chain_pulls_at_cloth_as_its_weight_at_a_node_would():
 def test_heavy_links_on_light_cloth_gain_no_energy():
     """Hung at two corners: 2 kg of chain on 18 g of cloth, which throws it up again.
 
-    Within 4 % of what the sheet stores, 2 to 3 % as the end swings: it alone, with that mass at a node, is as far off
+    Within 3.5 % of what the sheet stores, 1 to 3 % as the end swings: it alone, with that mass at a node, is as far off
     at 60 substeps a frame.
     """
     banner = sheet(rotation_deg=(90.0, 0.0, 0.0), pin=CORNERS[2:])
@@ -134,7 +134,7 @@ def test_heavy_links_on_light_cloth_gain_no_energy():
         world.advance_frame()
         energies.append(energy_of(world))
     assert start - min(energies) > 2.0
-    assert max(energies) < start + 0.04 * (start - min(energies))
+    assert max(energies) < start + 0.035 * (start - min(energies))
     assert rigid_of(world).diagnostics()["joint_gap"] < 1e-9
     assert cloth_of(world).diagnostics()["max_strain"] < 0.5
 

@@ -191,7 +191,7 @@ def test_what_has_crossed_a_triangle_is_put_back_to_its_side():
     world.advance_frame()
     coupling = next(each for each in world._couplings if isinstance(each, SoftClothCoupling))
     particles, sheets, met, blocks = coupling._soft.particles, coupling._sheets, coupling._met, coupling._blocks
-    coupling._find_hidden(blocks, coupling._stored)
+    coupling._find_hidden(blocks)
     nodes = sheets.before.to_numpy()
     raised = nodes + np.where(nodes[:, :1] > 0.0, 0.012, 0.0) * np.array([0.0, 0.0, 1.0])
     sheets.place.from_numpy(raised.astype(np.float32))
@@ -221,7 +221,7 @@ def test_a_sheet_that_turns_about_a_line_meets_all_that_it_sweeps_over():
     world.advance_frame()
     coupling = next(each for each in world._couplings if isinstance(each, SoftClothCoupling))
     particles, sheets, met, blocks = coupling._soft.particles, coupling._sheets, coupling._met, coupling._blocks
-    coupling._find_hidden(blocks, coupling._stored)
+    coupling._find_hidden(blocks)
     nodes = sheets.before.to_numpy().astype(np.float64)
     slope, rises = np.radians(30.0), nodes[:, 0] > 0.0
     turned = nodes.copy()
