@@ -69,7 +69,8 @@ def child() -> Iterator[ProcessPoolExecutor]:
 def test_a_sample_job_becomes_a_film(child, path, tmp_path):
     changes = {"frames": 2, "render.resolution": [64, 36], "render.samples": 1, "device": "cpu", **TINY[path.stem]}
     options = [part for key, value in changes.items() for part in ("--set", f"{key}={value}")]
-    code, told = child.submit(submit, path, "--farm", tmp_path, "--executor", "inline", *options).result(timeout=300)
+    making = child.submit(submit, path, "--farm", tmp_path, "--executor", "inline", *options)
+    code, told = making.result(timeout=1200)  # compiling may take minutes
     assert code == 0, told
     with av.open(str(tmp_path / path.stem / "movie.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 2
