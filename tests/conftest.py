@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes_seen import busiest
 
 from pipeline.base.threads import BLAS_THREADS
 
@@ -86,7 +87,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 class FailuresAsTheyCome:
-    """Writes a line for each failure where tests run in processes of their own, whose lines tell no names."""
+    """Names each failure where tests run in processes of their own, whose lines tell no names.
+
+    And what the machine was busy with: a test that waits too long may wait for what another one has left behind.
+    """
 
     def __init__(self, reporter: Any) -> None:
         self._reporter = reporter
@@ -96,6 +100,8 @@ class FailuresAsTheyCome:
         if report.failed and hasattr(report, "node"):
             self._reporter.ensure_newline()
             self._reporter.write_line(f"failed after {report.duration:.0f} s: {report.nodeid}")
+            load = ", ".join(f"{each:.0f}" for each in os.getloadavg())
+            self._reporter.write_line("\n    ".join([f"  load {load}; busiest:", *busiest()]))
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -5,7 +5,7 @@ import sys
 import time
 
 import psutil
-from processes_seen import lives, pid_lives, words_of
+from processes_seen import busiest, lives, pid_lives, words_of
 
 
 def test_a_process_that_ends_is_told_apart_before_and_after_it_is_collected():
@@ -23,3 +23,13 @@ def test_a_process_that_ends_is_told_apart_before_and_after_it_is_collected():
     assert not lives(seen) and not pid_lives(child.pid) and words_of(seen) == []
     child.communicate()
     assert not lives(seen) and not pid_lives(child.pid) and words_of(seen) == []
+
+
+def test_what_is_busy_is_named_with_the_test_that_began_it(request):
+    child = subprocess.Popen([sys.executable, "-c", "print(flush=True)\nwhile True: pass"], stdout=subprocess.PIPE)
+    try:
+        child.stdout.readline()
+        assert any(f" {child.pid} " in line and request.node.nodeid in line for line in busiest(1000))
+    finally:
+        child.kill()
+        child.communicate()
