@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.core.water import CAPILLARY_LENGTH, TENSION_OF_WATER
-from sim.fluid.traits import CFL_NUMBER, TRAITS, VISCOUS_NUMBER
+from sim.fluid.traits import CAPILLARY_NUMBER, CFL_NUMBER, COHESION_NUMBER, TRAITS, VISCOUS_NUMBER
 from sim.shapes.openings import InflowParameters
 from sim.shapes.parameters import Placement
 
@@ -197,6 +197,20 @@ class FluidParameters(Parameters):
     def skin(self) -> float:
         """Reach of the neighbour list beyond the support [support radii]."""
         return TRAITS[self.solver].skin
+
+    @property
+    def tension_step(self) -> float:
+        """Largest step that its surface tension allows [s]; infinite without any.
+
+        With `csf` that of the shortest capillary waves, a fraction of sqrt(rho d³/(2 pi sigma)). With the cohesion of
+        Becker & Teschner 2007 a particle swings on its neighbours' at a squared frequency of kappa/d³ at most.
+        """
+        if self.surface_tension == 0.0:
+            return math.inf
+        rate = self.surface_tension / self.lattice_volume
+        if self.surface_tension_model == "csf":
+            return CAPILLARY_NUMBER / math.sqrt(2.0 * math.pi * rate / self.rest_density)
+        return COHESION_NUMBER / math.sqrt(rate)
 
     @model_validator(mode="after")
     def _comes_from_somewhere(self) -> Self:

@@ -22,7 +22,7 @@ from sim.fluid.kernels import (
 )
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid
-from sim.fluid.traits import COHESION_NUMBER, tension_step
+from sim.fluid.traits import COHESION_NUMBER
 
 LAPLACE_STRESS = 0.2  # pressure in a drop of 10 spacings to the radius over sigma/d, which a flow has to expect
 TENSION_VISCOSITY = 0.07
@@ -70,7 +70,7 @@ class Cohesion:
         if is_csf:
             tension = max(fluid.surface_tension / fluid.rest_density for fluid in fluids)
             stress, viscosity = LAPLACE_STRESS * tension / spacing, TENSION_VISCOSITY * math.sqrt(tension * spacing)
-            rate = (COHESION_NUMBER / min(map(tension_step, fluids))) ** 2
+            rate = (COHESION_NUMBER / min(fluid.tension_step for fluid in fluids)) ** 2
         else:
             stress, viscosity = cohesion_stress(support_in_spacings) * strongest / spacing, 0.0
             rate = cohesion_rate(support_in_spacings) * strongest / spacing**3

@@ -3,10 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from sim.fluid.parameters import FluidParameters
 
 CFL_NUMBER = 0.4  # fraction of the particle spacing that a signal may cross in a step (Monaghan 1992)
 FORCE_NUMBER = 0.25  # fraction of sqrt(d / |a|) (Monaghan 1992, section 10.3)
@@ -97,17 +93,3 @@ def stable_time_step(
     if pressure_frequency > 0.0:
         limits.append(PRESSURE_NUMBER / pressure_frequency)
     return min(limits)
-
-
-def tension_step(fluid: "FluidParameters") -> float:
-    """Largest step that the surface tension of a fluid allows [s]; infinite without any.
-
-    With `csf` that of the shortest capillary waves, a fraction of sqrt(rho d³/(2 pi sigma)). With the cohesion of
-    Becker & Teschner 2007 a particle swings on its neighbours' at a squared frequency of kappa/d³ at most.
-    """
-    if fluid.surface_tension == 0.0:
-        return math.inf
-    rate = fluid.surface_tension / fluid.spacing**3
-    if fluid.surface_tension_model == "csf":
-        return CAPILLARY_NUMBER / math.sqrt(2.0 * math.pi * rate / fluid.rest_density)
-    return COHESION_NUMBER / math.sqrt(rate)

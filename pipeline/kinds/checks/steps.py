@@ -9,7 +9,7 @@ from pipeline.model.amounts import rounded_down, rounded_up
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 from sim.fluid.parameters import FluidParameters
-from sim.fluid.traits import TRAITS, tension_step
+from sim.fluid.traits import TRAITS
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
 from sim.shapes.solid import Solid
@@ -83,7 +83,7 @@ def _body_speed(body: RigidBodyParameters, solid: Solid, fall: float) -> float:
 def _check_tension(job: Job, index: int, of_flow: float, findings: Findings) -> None:
     """Warn of a surface tension whose steps are much shorter than those of the flow, of_flow [s]."""
     fluid = job.fluid[index]
-    allowed = tension_step(fluid)
+    allowed = fluid.tension_step
     slower = of_flow / allowed
     if slower > SLOWED_BY_TENSION:
         # Steps go as the root of the tension, and as d^1.5 where those of the flow go as d.
@@ -110,7 +110,7 @@ def _check_dye(job: Job, index: int, findings: Findings) -> None:
 
 def stable_dt(job: Job, fluid: FluidParameters, speed: float) -> float:
     """Largest step [s] at a largest speed [m/s], by the flow and by the surface tension of all fluids."""
-    return min(_dt_of_flow(job, fluid, speed), *map(tension_step, job.fluid))
+    return min(_dt_of_flow(job, fluid, speed), *(each.tension_step for each in job.fluid))
 
 
 def _dt_of_flow(job: Job, fluid: FluidParameters, speed: float) -> float:
