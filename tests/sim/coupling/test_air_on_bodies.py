@@ -230,3 +230,35 @@ def test_scenes_without_dynamic_bodies_have_no_air_that_pushes():
     world = build([led], cells=16, size=(1.0, 1.0, 1.0))
     assert world.solvers["air"].free_bodies is None
     assert not any("air_" in name for name in world.checkpoint())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shape", "density", "coefficient", "slack"),
+    [
+        ({"type": "box", "size": (0.3, 0.3, 0.04)}, 10.0, 1.17, 0.08),
+        ({"type": "sphere", "radius": 0.15}, 4.0, 0.45, 0.12),
+    ],
+    ids=["square plate", "ball"],
+)
+def test_light_bodies_fall_at_the_terminal_speed_of_their_drag_coefficient(shape, density, coefficient, slack):
+    """In a draught from below that holds them up, on a rail, so that they do not glide out of it.
+
+    C_D of a square plate is 1.17, of a ball 0.4 to 0.5 (Hoerner 1965), from Re of 10³ to 10⁵.
+    """
+    volume, section = (
+        (0.3 * 0.3 * 0.04, 0.09) if shape["type"] == "box" else (4.0 / 3.0 * np.pi * 0.15**3, np.pi * 0.15**2)
+    )
+    terminal = np.sqrt(2.0 * (density - AIR) * volume * G / (AIR * coefficient * section))
+    h = 0.3 / 8
+    size = (27 * h, 27 * h, 40 * h)
+    middle = (13.6 * h, 13.4 * h, 20 * h)
+    body = {"name": "body", "kind": "dynamic", "density": density, "shape": shape, "position": middle}
+    rail = {"name": "rail", "kind": "slider", "between": ["body"], "anchor": middle, "axis": (0.0, 0.0, 1.0)}
+    world = build([body], cells=40, size=size, joints=[rail], wind=(0.0, 0.0, terminal), fps=20.0)
+    speeds = []
+    for _ in range(24):
+        world.advance_frame()
+        speeds.append(terminal - bodies_of(world).velocity[0, 2])
+    # It has had three times what it takes to settle; eddies of the wake make it go up and down.
+    assert np.mean(speeds[12:]) == pytest.approx(terminal, rel=slack)
