@@ -256,6 +256,9 @@ class SmokeSolver:
 
     def give_way(self) -> None:
         """Let air at rest flow as obstacles move now, and bodies keep their velocities: others have set them going."""
+        for mover in self.obstacles.movers:
+            mover.exchange(0.0)
+        self.move_obstacles()  # once more: faces are open as between two commits
         if self.free_bodies is not None:
             self.free_bodies.hold()
         self._projection.project()

@@ -141,9 +141,11 @@ def test_a_light_body_that_is_thrown_keeps_its_velocity_at_the_start():
     """Who threw it has set the air around it going, too."""
     thrown = ball(0.16, 1.0, (0.5, 0.5, 0.5), velocity=(0.5, 0.0, 0.0))
     world = build([thrown], cells=24, size=(1.0, 1.0, 1.0), gravity=0.0, fps=240.0)
-    world.advance_frame()
-    # Air at rest would leave it rho_b/(rho_b + rho/2) = 0.62 of that.
-    assert bodies_of(world).velocity[0, 0] == pytest.approx(0.5, rel=0.03)
+    for _ in range(4):
+        world.advance_frame()
+    # Air at rest would leave it rho_b/(rho_b + rho/2) = 0.62 of that at once. Flow that has not parted from it does not
+    # slow it (d'Alembert): measured 0.1 % less after 4 frames.
+    assert bodies_of(world).velocity[0, 0] == pytest.approx(0.5, rel=0.005)
 
 
 def test_a_body_feels_the_first_of_two_smokes_in_one_place():
