@@ -83,7 +83,7 @@ def test_pressure_takes_the_energy_of_what_it_takes_away_from_air_and_bodies_tog
     before = get_faces(balls.grid, balls.velocity)
     report = balls.project()
     assert report.converged
-    assert report.iterations <= 40  # measured: 30 of a 24th of the air, 9 of 400 kg/m³ and 0.4; 7 where both are heavy
+    assert report.iterations <= 40  # measured: 30 of a 24th of the air, 9 of 400 kg/m³ and 0.4
     after = get_faces(balls.grid, balls.velocity)
     impulses = balls.bodies.impulses()
     v = VELOCITIES + impulses[:, :3] / balls.mass[:, None]
