@@ -288,12 +288,14 @@ def _build_smoke(
     frames_per_second: float,
 ) -> SmokeSolver:
     """The solver of one smoke, with static bodies in it, room for what will move in it, and its guide."""
+    movers = sum(body.kind != "static" for body in scene.rigid)
     return SmokeSolver(
         with_sources_on(smoke, scene.rigid),
         domain=scene.domain,
         gravity=scene.gravity,
         solids=[body.solid for body in static],
-        moving=_meets_particles(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
+        moving=_meets_particles(smoke, scene) or movers > 0,
+        free_bodies=movers if any(body.kind == "dynamic" for body in scene.rigid) else 0,
         forces=forces,
         frame_s=1.0 / frames_per_second,
         guide=_build_guide(smoke, scene, frames_per_second) if smoke.upres > 1 else None,
@@ -337,10 +339,12 @@ def _couple_smokes(
         in_the_way: list[Coupling] = []
         if _meets_particles(smoke.parameters, scene):
             in_the_way += [SmokeFluidCoupling(each, smoke, domain=scene.domain) for each in (*fluids, *softs)]
-        in_the_way += [] if rigid is None else [SmokeRigidCoupling(rigid, smoke)]
+        in_the_way += [] if rigid is None else [SmokeRigidCoupling(rigid, smoke, domain=scene.domain)]
         for coupling in in_the_way:
             coupling.exchange(0.0)
         smoke.move_obstacles()
+        if smoke.free_bodies is not None:
+            smoke.give_way()
         follows = any(source.follow is not None for source in smoke.parameters.source)
         in_the_way += [SmokeSourcesOnBodies(rigid, smoke)] if rigid is not None and follows else []
         couplings += [*in_the_way, *(SmokeClothCoupling(cloth, smoke, number=number) for cloth in cloths)]

@@ -17,7 +17,7 @@ from sim.smoke.arrays import new_floats
 from sim.smoke.cut_cells import ROUNDING
 from sim.smoke.grid import SmokeGrid, cell_corners
 from sim.smoke.lanes import Grid, cell_counts, row_start
-from sim.smoke.obstacles import Marks, mark
+from sim.smoke.obstacles import NOBODY, Marks, mark
 
 if TYPE_CHECKING:
     from sim.fluid.fluid import SPHFluid
@@ -106,6 +106,10 @@ class SmokeFluidCoupling(Coupling):
         time_s = float(copied(self._shortest_time)[0])
         return time_s if time_s < NEVER else math.inf
 
+    def reach(self, duration_s: float) -> list[NDArray[np.float64]]:  # noqa: ARG002  (the protocol of movers)
+        """None: the air pushes no fluid."""
+        return []
+
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that hold water now, after the steps of the fluid."""
         box, marks = self._smoke.obstacles.box, self._smoke.obstacles.marks
@@ -176,7 +180,7 @@ def _mark_water(box: Grid, sums: Sums, marks: Marks):
                             velocity[axis] += ti.cast(momentum[at], ti.f32) * (MOMENTUM_QUANTUM / fraction)
             if count > 0:
                 distance = ti.select(count == beside, -1.0, 0.0)
-                mark(marks, row_start(box, i, j) + k, distance, velocity / float(count))
+                mark(marks, row_start(box, i, j) + k, distance, velocity / float(count), NOBODY)
 
 
 def room_for_water(grid: SmokeGrid, domain: DomainParameters, reach: float) -> NDArray[np.float64]:

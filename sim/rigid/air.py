@@ -57,7 +57,8 @@ class OuterForces:
     A plate across the wind has a drag coefficient of C, a ball of C/2; a plate aslant has lift, and one that turns is
     slowed. Nothing pulls at lee sides, and nothing rubs. Air and drag take at most what brings a body to rest in it:
     the force is divided by 1 + dt r, r the largest rate at which it slows the body. Each piece of a body that breaks
-    has its own part of the forces; r is of all that it is glued to, and on faces that are glued nothing blows.
+    has its own part of the forces; r is of all that it is glued to, and on faces that are glued nothing blows. Where
+    others compute the air around a body (`Surroundings`), that presses in place of this law.
     """
 
     def __init__(
@@ -78,15 +79,15 @@ class OuterForces:
         self._samples = Samples(*map(np.concatenate, zip(*found, strict=True)))
         self._covers = _covers_of(planes, self._samples, solids) if glue is not None and forces.blows else None
 
-    def push(self, bodies: MovingBodies, gravity: Float64Array, dt: float) -> None:
-        """Let them act on dynamic bodies for dt [s]."""
+    def push(self, bodies: MovingBodies, gravity: Float64Array, dt: float, is_surrounded: NDArray[np.bool_]) -> None:
+        """Let them act on dynamic bodies for dt [s]; no wind does on those that other air surrounds, (n,)."""
         n, glue = len(bodies), self._glue
         leader, movers = (np.arange(n), bodies) if glue is None else (glue.leader, glue.movers)
         given, pressed, slowing, lost = np.zeros((n, 3)), np.zeros((n, 6)), np.zeros((n, 2)), np.zeros(n)
         tensors = movers.inverse_inertia().reshape(n, 9)
         whole = Whole(movers.position[leader], movers.inverse_mass[leader], tensors[leader])
-        now = self._forces.now
-        push_bodies(now, self._open_samples(), self._drag, bodies.moving(), whole, dt, given, pressed, slowing, lost)
+        now, drag = self._forces.now, np.where(is_surrounded, 0.0, self._drag)
+        push_bodies(now, self._open_samples(), drag, bodies.moving(), whole, dt, given, pressed, slowing, lost)
         rates = np.zeros((n, 2))
         np.add.at(rates, leader, slowing)
         pressed *= (dt / (1.0 + dt * rates.max(axis=1)))[leader, None]

@@ -46,7 +46,8 @@ class RigidBodyParameters(WeightedPlacement):
     air_drag: NonNegative = Field(
         default=1.0,
         description="Coefficient by which the air of a [[force]], moving or still, presses on faces that it blows onto "
-        "[-]: the drag coefficient of a plate across it, twice that of a ball. Without such a force there is no air.",
+        "[-]: the drag coefficient of a plate across it, twice that of a ball. Without such a force there is no air "
+        "but in the box of a smoke, where its pressure acts instead.",
     )
     friction: NonNegative = Field(
         default=0.5, description="Coulomb friction [-]; a pair of bodies has the geometric mean of its two."

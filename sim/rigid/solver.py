@@ -32,6 +32,7 @@ from sim.rigid.parts import PartsDetector, detector_of
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies, lengths
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
+from sim.rigid.surroundings import NOWHERE, Surroundings
 from sim.shapes.body_geometry import BodyGeometry
 
 LARGEST_DT = 2.0e-3
@@ -83,6 +84,7 @@ class RigidSolver:
         joints: between the bodies, or None.
         deforming: deformations of the bodies that have one, by their number.
         glue: between the pieces of bodies that break, or None.
+        surroundings: the air that others compute around them.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
         has_own_steps: whether fast bodies divide the step of all; nothing that is coupled to them shares it then.
 
@@ -137,6 +139,7 @@ class RigidSolver:
         has_pieces = any(body.whole is not None for body in parameters)
         self.glue = Glue(parameters, self.solids, self.bodies) if has_pieces else None
         self._obey_links()
+        self.surroundings = Surroundings(self.bodies, self.solids, self.glue)
         self.has_own_steps = False
         self._outer_forces = self._forces_on(parameters, forces)
         self._domain_centre = corners.mean(axis=0)
@@ -217,9 +220,11 @@ class RigidSolver:
         """Advance by dt [s]; groups of bodies that are too fast for it by several steps of their own."""
         bodies, start_s = self.bodies, self.time_s
         if self._outer_forces is not None:
-            self._outer_forces.push(bodies, self.gravity, dt)
+            self._outer_forces.push(bodies, self.gravity, dt, self.surroundings.where() != NOWHERE)
             if self.glue is not None:
                 self.glue.share()
+        if self.surroundings.boxes:
+            self.surroundings.push(self.gravity, dt)
         if bodies.is_dynamic.any() and self.first_bad_quantity() is None:
             awake = self._awake(dt)
             for count, is_active in self._chooser.divided(self.poses(), dt, awake):
@@ -597,6 +602,7 @@ class RigidSolver:
             **self._detector.checkpoint(),
             **({} if self.joints is None else self.joints.checkpoint()),
             **({} if self.glue is None else self.glue.checkpoint()),
+            **self.surroundings.checkpoint(),
             "clock": np.array([self.time_s]),
         }
 
@@ -613,6 +619,7 @@ class RigidSolver:
             setattr(self.bodies, name, np.array(arrays[name], dtype=getattr(self.bodies, name).dtype))
         if self.glue is not None:
             self.glue.restore(arrays)
+        self.surroundings.restore(arrays)
         self._obey_links()
         self._detector.restore(arrays)
         self.time_s = float(arrays["clock"][0])

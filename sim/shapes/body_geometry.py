@@ -73,6 +73,12 @@ class BodyGeometry:
         return properties
 
     @cached_property
+    def displaced(self) -> tuple[float, NDArray[np.float64]]:
+        """Volume [m³], and its centre in the body's frame [m], (3,); where parts of a compound overlap both count."""
+        whole = reduce(MassProperties.joined, (unit for unit, _ in self._materials))
+        return whole.mass, whole.centre_of_mass - self.centre_of_mass
+
+    @cached_property
     def contact_parts(self) -> tuple[ContactPart, ...]:
         """The solids that stand for the body in contacts: itself, those of an assembly, or convex pieces of a mesh."""
         shape, scale = self.solid.shape, self.solid.scale

@@ -7,7 +7,7 @@ the solid in cells and the velocity that the solid has there, on both sides of i
     def _mark(box: Grid, marks: Marks, ...):
         for i, j in ti.ndrange((1, box.nx + 2), (1, box.ny + 2)):
             for k in range(1, box.nz + 2):
-                mark(marks, row_start(box, i, j) + k, distance, velocity)
+                mark(marks, row_start(box, i, j) + k, distance, velocity, NOBODY)
 
     _mark(smoke.obstacles.box, smoke.obstacles.marks, ...)
 
@@ -31,6 +31,8 @@ from sim.smoke.cut_cells import FAR, ROUNDING, find_keepers, mark_keepers, measu
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid, device_grid, lane_items, lane_place, row_start, steps
 
+NOBODY = -1  # owner of corners of what no air moves
+
 
 class Mover(Protocol):
     """Somebody who marks corners."""
@@ -40,6 +42,9 @@ class Mover(Protocol):
 
     def exchange(self, dt: float) -> None:
         """Mark them where they are, at the end of a step of dt [s]."""
+
+    def reach(self, duration_s: float) -> list[NDArray[np.float64]]:
+        """Lower and upper corner, (2, 3), of where each of its free bodies may come in so long [m], from now on."""
 
 
 def time_of_travel(distance: float, speed: float, acceleration: float) -> float:
@@ -63,8 +68,10 @@ class Solids(NamedTuple):
     words: Integers  # who keeps what small cells hold (`cut_cells`)
     distance: Floats  # of corners from solids, not beyond `FAR` [cells]; negative inside
     velocity: Faces  # of the nearest solid at corners [m/s]
+    owner: Integers  # number of the free body that this is at corners (`free_bodies`), or `NOBODY`
     cuts: ti.template()  # whether there are or may be solids
     moving: ti.template()  # whether they may move
+    carries: ti.template()  # whether some are free bodies
 
 
 @bundle
@@ -73,6 +80,8 @@ class Marks(NamedTuple):
 
     distance: Floats
     velocity: Faces
+    owner: Integers
+    carries: ti.template()
 
 
 @bundle
@@ -97,7 +106,8 @@ class Obstacles:
         marks: of the next commit.
     """
 
-    def __init__(self, grid: SmokeGrid, *, moving: bool = False) -> None:
+    def __init__(self, grid: SmokeGrid, *, moving: bool = False, carries: bool = False) -> None:
+        """Take a grid, and whether others will mark corners, free bodies among them."""
         self.grid, self.box, self.moving = grid, device_grid(grid.cells), moving
         self.movers: list[Mover] = []
         cuts = moving or grid.has_solids
@@ -106,10 +116,11 @@ class Obstacles:
         before = new_floats(size) if moving else volume
         for array in (volume, before):
             array.fill(1.0)
-        self.solids = Solids(
-            new_faces(size), volume, before, ti.ndarray(ti.i32, size), distance, velocity, cuts, moving
-        )
-        self.marks = Marks(new_floats(of_movers), velocity)
+        words, owner = ti.ndarray(ti.i32, size), ti.ndarray(ti.i32, size if carries else 1)
+        owner.fill(NOBODY)
+        kinds = cuts, moving, carries
+        self.solids = Solids(new_faces(size), volume, before, words, distance, velocity, owner, *kinds)
+        self.marks = Marks(new_floats(of_movers), velocity, owner, carries)
         self._static, self._distance_before = new_floats(of_movers), new_floats(size) if moving else distance
         if cuts:
             distance.from_numpy(self._flat(grid.distance))
@@ -186,14 +197,19 @@ class Obstacles:
 
 
 @func
-def mark(marks: Marks, at: ti.i32, distance: ti.f32, velocity):
-    """The corner at a flat index is so far from a solid in the coming step [cells], which moves there so fast [m/s]."""
+def mark(marks: Marks, at: ti.i32, distance: ti.f32, velocity, owner: ti.i32):
+    """The corner at a flat index is so far from a solid in the coming step [cells], which moves there so fast [m/s].
+
+    The owner is the number of a free body, or `NOBODY`.
+    """
     rounded = ti.select(ti.abs(distance) < ROUNDING, 0.0, distance)
     if rounded < marks.distance[at]:
         marks.distance[at] = rounded
         marks.velocity.x[at] = velocity[0]
         marks.velocity.y[at] = velocity[1]
         marks.velocity.z[at] = velocity[2]
+        if ti.static(marks.carries):
+            marks.owner[at] = owner
 
 
 @func
@@ -272,6 +288,8 @@ def _swap(box: Grid, solids: Solids, before: Floats, static: Floats, marked: Flo
                 solids.velocity.x[at] = 0.0
                 solids.velocity.y[at] = 0.0
                 solids.velocity.z[at] = 0.0
+                if ti.static(solids.carries):
+                    solids.owner[at] = NOBODY
             marked[at] = static[at]
         changed += in_row
     return changed

@@ -22,6 +22,8 @@ from sim.shapes.parameters import Placement
 WHOLE = 1.0e-6  # part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001
 MOST_CELLS = 2**30  # of one smoke, 1024 along each edge: a job with more is refused, a file of more was never written
 MOST_UPRES = 4  # cells of a guide over those of its smoke: coarser ones have hardly any motion of the film's
+SEA_LEVEL_PRESSURE = 101325.0  # [Pa]
+GAS_CONSTANT_OF_AIR = 287.05  # dry [J/(kg K)]
 CELLS_PER_EDDY = 2.0  # eddies of gusts are at least so many cells wide: the grid carries nothing finer
 
 Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]
@@ -251,6 +253,11 @@ class SmokeParameters(Parameters):
         if gusts.strength > 0.0:
             gusts = gusts.model_copy(update={"size": max(gusts.size, CELLS_PER_EDDY * cell_size)})
         return self.model_copy(update={"upres": 1, "cell_size": cell_size, "turbulence": gusts})
+
+    @property
+    def air_density(self) -> float:
+        """Of the air without smoke, an ideal gas at sea level [kg/m³]."""
+        return SEA_LEVEL_PRESSURE / (GAS_CONSTANT_OF_AIR * self.ambient_temperature)
 
     @property
     def hottest_excess(self) -> float:

@@ -9,7 +9,8 @@ part (Batty, Bertails & Bridson 2007; Ng, Min & Gibou 2009). What moves with the
 drives the air: the flux through a face is A u + (1 - A) u_solid. Gas that burns expands
 (`sim.smoke.combustion`): there div u is what that asks for. A closed region has a solution only if no volume flows into
 it in sum. What obstacles press into it all the same, as a piston does, is spread evenly over its air: it is
-compressed, or expands, at the same rate everywhere.
+compressed, or expands, at the same rate everywhere. Rigid bodies that are free give way to the pressure within the
+solve (`free_bodies`).
 
 Flexible conjugate gradients (Notay 2000) because the preconditioner is not symmetric. When the recursion has reached
 its goal the velocity is corrected and its divergence measured anew; if rounding kept it above the goal, another solve
@@ -26,6 +27,7 @@ from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_floats
 from sim.smoke.cut_cells import CHANGES, NEAR_SOLIDS
+from sim.smoke.free_bodies import Carried, FreeBodies, flux_of_answer
 from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start
 from sim.smoke.multigrid import Equation, MultigridVCycle, laplacian
 from sim.smoke.obstacles import Obstacles, Solids, flux_part, mean_volume, wall_flux
@@ -78,8 +80,10 @@ class PressureProjection:
         tolerance: float,
         max_iterations: int,
         expansion: ti.Ndarray | None = None,
+        bodies: FreeBodies | None = None,
     ) -> None:
-        """Take what is in the way, the velocity, and the divergence that is to be left, times h [m/s], if any."""
+        """Take what is in the way, the velocity, the divergence that is to be left, times h [m/s], and free bodies."""
+        self._bodies = FreeBodies(1) if bodies is None else bodies
         self._tolerance, self._max_iterations = tolerance, max_iterations
         self._cell_size = obstacles.grid.cell_size
         self._box, self._obstacles, self._velocity = obstacles.box, obstacles, velocity
@@ -99,11 +103,14 @@ class PressureProjection:
     def project(self) -> ProjectionReport:
         """Remove the divergence of the velocity; what is closed to pressure keeps it."""
         self._clear_work()
+        self._bodies.begin()
         divergence, speed, compression = self._measure()
         iterations = 0
         while divergence > self._tolerance * speed and iterations < self._max_iterations:
             iterations += self._solve(SAFETY * self._tolerance * speed, self._max_iterations - iterations)
             openness, solids = self.multigrid.coefficients.operator.faces, self._obstacles.solids
+            if solids.carries:
+                self._bodies.take(self._box, solids, self._search.correction)
             _subtract_gradient(self._box, self._search.correction, openness, solids, self._velocity)
             divergence, speed, _ = self._measure()
         return ProjectionReport(
@@ -122,13 +129,20 @@ class PressureProjection:
         self.multigrid.apply()
         _start_search(self._box, self._search)
         for iteration in range(1, max_iterations):
-            residual, advanced = _advance(self._box, self._search)
+            residual, advanced = self._advance()
             if residual <= goal or advanced == 0.0:
                 return iteration
             self.multigrid.apply()
             _turn_search(self._box, self._search)
-        _advance(self._box, self._search)
+        self._advance()
         return max_iterations
+
+    def _advance(self) -> tuple[float, float]:
+        solids = self._obstacles.solids
+        if solids.carries:
+            self._bodies.answer(self._box, solids, self._search.direction)
+        residual, advanced = _advance(self._box, solids, self._bodies.carried, self._search)
+        return residual, advanced
 
     def _measure(self) -> tuple[float, float, float]:
         """Set the residual to h (expansion - div u), less its mean in closed regions.
@@ -214,8 +228,10 @@ def _start_search(box: Grid, search: Search):
 
 
 @kernel
-def _advance(box: Grid, search: Search) -> Pair:
+def _advance(box: Grid, solids: Solids, carried: Carried, search: Search) -> Pair:
     """Go along p to the smallest error: alpha = r.z / p.Ap, q += alpha p, r -= alpha Ap.
+
+    Bodies have answered to p.
 
     Returns:
         max|r|, and 1, or 0 where there was no way to go: p.Ap and r.z vanish together once the residual does.
@@ -226,6 +242,8 @@ def _advance(box: Grid, search: Search) -> Pair:
         p_Ap = 0.0
         for n in range(lane_items(box, box.nz, lane)):
             at = row + lane_place(box, n, lane)
+            if ti.static(solids.carries):
+                search.image[at] -= flux_of_answer(box, solids, carried, i, j, lane_place(box, n, lane))
             p_Ap += search.image[at] * search.direction[at]
         search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([p_Ap, 0.0])
     sum_up(search.rows)

@@ -23,6 +23,7 @@ from sim.smoke.arrays import new_state
 from sim.smoke.combustion import Combustion
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import accelerate, cool, upward
+from sim.smoke.free_bodies import FreeBodies
 from sim.smoke.grid import Index3, SmokeGrid, Window
 from sim.smoke.guide import Guide
 from sim.smoke.lanes import lane_items, lane_place, row_start
@@ -70,6 +71,7 @@ class SmokeSolver:
         air_forces: what pushes the air from outside, in this order in every substep.
         sources: where smoke comes from, in the order of the parameters.
         refusal: of more cells (`Grows`).
+        free_bodies: what the air pushes; None: nothing.
         guide: what its large motion is drawn to; None: nothing.
 
     Raises:
@@ -86,11 +88,14 @@ class SmokeSolver:
         gravity: Vector3,
         solids: Sequence[HasSignedDistance] = (),
         moving: bool = False,
+        free_bodies: int = 0,
         forces: ForceField | None = None,
         frame_s: float = 1.0 / 24.0,
         guide: Guide | None = None,
     ) -> None:
         """Take a smoke, which may have the domain for its box, static solids, and room for obstacles that move.
+
+        Of these so many are bodies that the air may push.
 
         A window is fitted to frames of `frame_s` [s].
         """
@@ -99,6 +104,7 @@ class SmokeSolver:
         self.sources = sources_of(parameters)
         self.air_forces: list[AirForce] = []
         self.refusal: Callable[[float], str | None] | None = None
+        self.free_bodies = FreeBodies(free_bodies) if free_bodies else None
         self.guide: Guide | None = None  # none yet: what follows begins no frame of it
         self._gravity, self._has_gravity = gravity, any(upward(gravity))
         self._lift = parameters.lift_per_kelvin(gravity)
@@ -108,7 +114,7 @@ class SmokeSolver:
         self._frame_s, self._fitting = frame_s, Fitting(parameters, domain, frame_s, is_stirred=stirred)
         window = self._fitting.first(source.bounds(0.0, 0.0) for source in self.sources)
         self.grid = SmokeGrid.build(parameters, domain, solids, window)
-        self.obstacles = Obstacles(self.grid, moving=moving)
+        self.obstacles = Obstacles(self.grid, moving=moving, carries=free_bodies > 0)
         self._compute_in_grid()
         require_cells(parameters, self.sources, self.grid)
         self._emitted_mass, self._burnt_fuel, self._expanded = 0.0, 0.0, 0.0
@@ -136,6 +142,7 @@ class SmokeSolver:
             tolerance=parameters.projection_tolerance,
             max_iterations=parameters.projection_max_iterations,
             expansion=None if self._combustion is None else self._combustion.expansion,
+            bodies=self.free_bodies,
         )
         operator, work = self._projection.multigrid.coefficients.operator, self._projection.work
         self.air = Air(self.obstacles.box, self.obstacles.solids, operator.faces, self.state)
@@ -170,7 +177,7 @@ class SmokeSolver:
         del self._projection, self._advection, self._transport, self._extrapolation, self._turbulence, self._rows
         del self.air, self.obstacles
         self.grid = SmokeGrid.of_box(self.parameters, self._domain, window).with_solids_of(self._cells_of_solids)
-        self.obstacles = Obstacles(self.grid, moving=moving)
+        self.obstacles = Obstacles(self.grid, moving=moving, carries=self.free_bodies is not None)
         self.obstacles.movers += movers
         self._compute_in_grid()
         if any(self._outside.velocity):
@@ -247,15 +254,26 @@ class SmokeSolver:
         if self.obstacles.commit():
             self._follow_obstacles()
 
+    def give_way(self) -> None:
+        """Let air at rest flow as obstacles move now, and bodies keep their velocities: others have set them going."""
+        for mover in self.obstacles.movers:
+            mover.exchange(0.0)
+        self.move_obstacles()  # once more: faces are open as between two commits
+        if self.free_bodies is not None:
+            self.free_bodies.hold()
+        self._projection.project()
+        self._extrapolation.fill()
+
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]; a window is fitted to what is there."""
         self.time_s = time_s
         self._projections: list[ProjectionReport] = []
         if self._fitting.follows:
             frame = time_s, time_s + self._frame_s
-            emitting = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
+            there = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
+            there += [box for mover in self.obstacles.movers for box in mover.reach(self._frame_s)]
             fuel = None if self._combustion is None else self._combustion.fuel
-            given = self.grid.window, self._outside.velocity, emitting, self._rows
+            given = self.grid.window, self._outside.velocity, there, self._rows
             self._move_window(self._fitting.next(self.air, fuel, *given))
         if self.guide is not None:
             self.guide.begin_frame(time_s, self.refusal)

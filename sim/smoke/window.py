@@ -1,10 +1,10 @@
 """The window: the part of a smoke's box that is computed, a box of cells around where there is something.
 
 A smoke whose grid follows is fitted at the start of frames. What has to be in the window is called *busy*: cells with
-smoke, heat or fuel, and air that moves against the wind, unless all air is stirred; sources that emit; and where the
-air's own velocity takes all this within the frame. Around it lie `MARGIN` cells, and ends lie on blocks of `BLOCK`
-cells, counted from the lower corner of the smoke's box. Where the window ends, and the box does not, its sides are open
-to air as it is outside (`sim.smoke.sides`): at rest, or with the wind.
+smoke, heat or fuel, and air that moves against the wind, unless all air is stirred; sources that emit; bodies that the
+air may push; and where the air's own velocity takes all this within the frame. Around it lie `MARGIN` cells, and ends
+lie on blocks of `BLOCK` cells, counted from the lower corner of the smoke's box. Where the window ends, and the box
+does not, its sides are open to air as it is outside (`sim.smoke.sides`): at rest, or with the wind.
 
 The window is left as it is while the next frame fits and it is not much too large; a new one is fitted to some frames
 ahead, so that a front that moves does not ask for one in each.
@@ -70,16 +70,17 @@ class Fitting:
         return None if ends is None or not self.follows else self._fitted(ends)
 
     def next(
-        self, air: Air, fuel: ti.Ndarray | None, window: Window, wind: Vector3, sources: Iterable[Ends], rows: Rows
+        self, air: Air, fuel: ti.Ndarray | None, window: Window, wind: Vector3, there: Iterable[Ends], rows: Rows
     ) -> Window:
         """The window of the coming frame: the present one, unless that is too small or much too large.
 
-        Air outside has the velocity of a wind [m/s]. Sources are those that emit in the frame, each between the corners
-        of where it does [m]. Where neither they nor anything else is left, the middle of the window stays.
+        Air outside has the velocity of a wind [m/s]. What is there are sources that emit in the frame, and bodies, each
+        between the corners of where it is [m]. Where neither they nor anything else is left, the middle of the window
+        stays.
         """
-        emitting = self._in_cells(sources)
+        given = self._in_cells(there)
         soon, later = (
-            _union(emitting, self._busy(air, fuel, window, wind, frames, rows)) for frames in (1.0, FRAMES_AHEAD)
+            _union(given, self._busy(air, fuel, window, wind, frames, rows)) for frames in (1.0, FRAMES_AHEAD)
         )
         low, high = np.asarray(window.first), np.asarray(window.first) + window.cells
         nothing = np.stack([0.5 * (low + high)] * 2)

@@ -67,7 +67,7 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
 def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (PROJECT / "docs" / "guide" / "job-file.md").read_text(encoding="utf-8")
     examples = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
-    example, many, hammer, vase, led, pouring, joints, forces, cloth, smoke, soft, limits = examples
+    example, many, hammer, vase, led, pouring, joints, forces, sinking, cloth, smoke, soft, limits = examples
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
     (tmp_path / "limited.toml").write_text(f"{example}{limits}")
@@ -80,6 +80,8 @@ def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
         "domino": 40,
         "stone": 200,
     }
+    (tmp_path / "sinking.toml").write_text(f'name = "sinking"\nframes = 2\n{sinking}')
+    assert load_job(tmp_path / "sinking.toml").rigid[0].air_drag == 1.0
     (tmp_path / "led.toml").write_text(f'name = "led"\nframes = 2\n{led}')
     assert load_job(tmp_path / "led.toml").rigid[0].shape.type == "animation"
     (tmp_path / "broken.toml").write_text(f'name = "broken"\n{hammer}{vase}')

@@ -183,7 +183,7 @@ def coupled(channel, body, gravity=(0.0, 0.0, 0.0)):
     """A body that is alone, and what it is to the smoke of the channel."""
     smoke = smoke_of(channel[0])
     rigid = RigidSolver([RigidBodyParameters.model_validate(body)], domain=DOMAIN, gravity=gravity)
-    coupling = SmokeRigidCoupling(rigid, smoke)
+    coupling = SmokeRigidCoupling(rigid, smoke, domain=DOMAIN)
     smoke.obstacles.movers.remove(coupling)
     return rigid, coupling
 
