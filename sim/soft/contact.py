@@ -28,6 +28,7 @@ from sim.core.launch import kernel
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.moving_shapes import Bodies, MovingShapes, distance_of, normal_of, velocity_at
 from sim.soft.blocks import NODES, Blocks, place_of_node
+from sim.soft.packing import REACH, room_left, share_before
 from sim.soft.transfers import Nodes
 
 Float64Array = NDArray[np.float64]
@@ -128,6 +129,10 @@ class BodyContacts:
             self._find_gains()
         collide(blocks, stored, nodes, touching)
 
+    def take_room(self, blocks: Blocks, stored: int, nodes: Nodes) -> None:
+        """Take from the room of nodes what bodies fill."""
+        take_room(blocks, stored, nodes, self._touching)
+
     def _find_gains(self) -> None:
         """Solve for what each body's motion gains."""
         touching, unit = self._touching, self._mass / QUANTA
@@ -166,6 +171,19 @@ def body_at(x: ti.math.vec3, touching: Touching, cell_size: ti.f32) -> ti.i32:
             if distance < least:
                 body, least = b, distance
     return body
+
+
+@kernel
+def take_room(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touching):
+    """Take from the room of nodes what bodies fill."""
+    for n in range(stored * NODES):
+        if nodes.mass[n] > 0.0:
+            x = place_of_node(n, blocks)
+            for b in range(touching.count):
+                if (x - touching.bodies.position[b]).norm() < touching.radius[b] + REACH * blocks.edge:
+                    distance = distance_of(x, b, touching.bodies) / blocks.edge
+                    if distance < REACH:
+                        nodes.room[n] = room_left(nodes.room[n], share_before(distance), blocks)
 
 
 @ti.func

@@ -5,12 +5,12 @@ strains are lost in b itself. In principal directions, which plastic flow of iso
 
     b_i = 1 + e_i,   Hencky strain h_i = ln(b_i)/2,   Kirchhoff stress tau = J sigma
 
-Sources: Simo & Hughes 1998 (return mappings), Klár et al. 2016 (sand), Stomakhin et al. 2013 (snow), Tampubolon et al.
-2017 (volume that sand gained while it was apart). The cone of sand goes through a slope that is about to slide, shear
-tan(phi) p, as in Jop et al. 2006; that of Klár et al. touches Mohr and Coulomb's in compression, and lets sand of 33
-degrees stand at 50 in plane strain.
+Sources: Simo & Hughes 1998 (return mappings), Klár et al. 2016 (sand), Stomakhin et al. 2013 (snow). The cone of sand
+goes through a slope that is about to slide, shear tan(phi) p, as in Jop et al. 2006; that of Klár et al. touches Mohr
+and Coulomb's in compression, and lets sand of 33 degrees stand at 50 in plane strain.
 """
 
+import math
 from typing import NamedTuple
 
 import taichi as ti
@@ -25,6 +25,12 @@ Vector = ti.math.vec3
 SWEEPS = 4  # of Jacobi's rotations, which converge quadratically: off-diagonals vanish in single precision
 SMALL = 0.3  # up to which series of log1p and expm1 are taken, whose next terms are below 1e-7
 NEWTON = 6  # steps of Newton's method: the root is within twice of where it starts
+APART = math.log(2.0)
+"""Hencky strain of volume from which on sand has come apart: its grains have left their neighbours [-]."""
+
+DENSE = 0.95
+"""Density over that at rest from which on sand that was apart presses again [-]; below 1, as particles lie anyhow."""
+
 MOST_HARDENED, LEAST_HARDENED = 3.0, -2.0
 """Exponents of snow's hardening at most and at least, exp(3) = 20 times as stiff: steps get shorter with its root."""
 
@@ -34,6 +40,7 @@ class Laws(NamedTuple):
     """Materials of the soft bodies, (bodies,) each."""
 
     law: Integers
+    dense: Floats  # SAND: density from which on it presses once it was apart [kg/m³]
     mu: Floats  # Lamé's [Pa]
     lam: Floats
     slope: Floats  # SAND: of the cone, |s| over 3 p, sqrt(2)/3 tan(phi) [-]
@@ -116,36 +123,34 @@ def moved_strain(e: Matrix, change: Matrix) -> Matrix:
 
 
 @func
-def neo_hookean(e: Matrix, mu: ti.f32, lam: ti.f32) -> Matrix:
-    """tau = mu (b - 1) + lambda ln J (Simo & Hughes 1998, 9.2)."""
+def volume_strain(e: Matrix) -> ti.f32:
+    """ln J."""
     trace = e.trace()
     squares = (e @ e).trace()
-    volume = trace + 0.5 * (trace * trace - squares) + e.determinant()
-    return mu * e + spherical(0.5 * lam * log1p(volume))
+    return 0.5 * log1p(trace + 0.5 * (trace * trace - squares) + e.determinant())
 
 
 @func
-def yielded_sand(strain: Vector, b: ti.i32, gained: ti.f32, laws: Laws):
-    """Hencky strains on or within the Drucker-Prager cone, and the volume gained then, as a Hencky strain.
+def neo_hookean(e: Matrix, mu: ti.f32, lam: ti.f32) -> Matrix:
+    """tau = mu (b - 1) + lambda ln J (Simo & Hughes 1998, 9.2)."""
+    return mu * e + spherical(lam * volume_strain(e))
 
-    Apart, its strain goes to the tip of the cone and is remembered; it presses again only once it is that much denser.
-    """
+
+@func
+def is_apart(b: ti.i32, history: ti.f32, laws: Laws) -> ti.i32:
+    """Whether a particle is of sand that has come apart."""
+    return int(laws.law[b] == ti.static(int(Law.SAND)) and history >= APART)
+
+
+@func
+def yielded_sand(strain: Vector, b: ti.i32, gained: ti.f32, laws: Laws) -> Vector:
+    """Hencky strains on or within the Drucker-Prager cone, once the volume gained before is taken back."""
     mu, lam = laws.mu[b], laws.lam[b]
-    tip = laws.tip[b]
-    volume = strain.sum() + gained - tip
+    volume = strain.sum() + gained
     deviator = strain - strain.sum() / 3.0
     norm = deviator.norm()
-    result = Vector(0.0)
-    left = 0.0
-    if volume >= 0.0:
-        result = Vector(tip / 3.0)
-        left = volume
-    else:
-        excess = norm + (3.0 * lam + 2.0 * mu) / (2.0 * mu) * volume * laws.slope[b]
-        result = Vector((volume + tip) / 3.0) + deviator
-        if excess > 0.0:
-            result -= excess / ti.max(norm, 1.0e-20) * deviator
-    return result, left
+    excess = norm + (3.0 * lam + 2.0 * mu) / (2.0 * mu) * (volume - laws.tip[b]) * laws.slope[b]
+    return volume / 3.0 + deviator * (1.0 - ti.max(excess, 0.0) / ti.max(norm, 1.0e-20))
 
 
 @func
@@ -199,12 +204,19 @@ def hardened(hardening: ti.f32, plastic: ti.f32) -> ti.f32:
 def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
     """What becomes of a trial strain e in a step of dt [s]: the elastic strain, the Kirchhoff stress [Pa], the history.
 
-    The history is the Hencky strain of volume that sand gained while it was apart, or that snow lost for good.
+    The history is the Hencky strain of volume that sand which is apart has gained, or that snow lost for good.
     """
     law, mu, lam = laws.law[b], laws.mu[b], laws.lam[b]
     e, stress, told = trial, Matrix(0.0), history
+    apart = -1.0
+    if law == ti.static(int(Law.SAND)):
+        apart = volume_strain(trial) + history - laws.tip[b]
     if law == ti.static(int(Law.ELASTIC)):
         stress = neo_hookean(trial, mu, lam)
+    elif apart >= 0.0:
+        # Its strain goes to the tip of the cone; it presses again only once it is that much denser.
+        tip = laws.tip[b]
+        e, stress, told = spherical(expm1(2.0 / 3.0 * tip)), spherical((2.0 / 3.0 * mu + lam) * tip), apart
     else:
         values, axes = principal(trial)
         strain = Vector(0.0)
@@ -212,7 +224,7 @@ def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
             strain[k] = 0.5 * log1p(values[k])
         after = strain
         if law == ti.static(int(Law.SAND)):
-            after, told = yielded_sand(strain, b, history, laws)
+            after, told = yielded_sand(strain, b, history, laws), 0.0
         elif law == ti.static(int(Law.CLAY)):
             after = yielded_clay(strain, b, dt, laws)
         else:

@@ -23,8 +23,9 @@ from sim.shapes.filled_volume import Surroundings, pack
 from sim.shapes.placement import build_solid
 from sim.soft.blocks import NODES, BlockGrid, Blocks, sorted_by_cell
 from sim.soft.contact import BodyContacts, stop_at_walls
-from sim.soft.laws import Laws
+from sim.soft.laws import APART, DENSE, Laws
 from sim.soft.materials import Law
+from sim.soft.packing import find_room
 from sim.soft.parameters import LIVE_KEYS, SoftParameters, shared_conflicts
 from sim.soft.pouring import Poured, Pouring, has_come, waiting_rows
 from sim.soft.transfers import (
@@ -112,8 +113,11 @@ class SoftSolver:
         density = np.array([each.value("density") for each in self.parameters])
         particle_mass = density * volume
         self.mass = float(particle_mass[self.owner].sum())
-        rows_of = [ti.ndarray(ti.f32, components * n) for components in (9, len(SYMMETRIC), len(SYMMETRIC), 1)]
-        self.particles = Particles(on_device(position), on_device(velocity), *rows_of, on_device(body), n)
+        rows_of = [ti.ndarray(ti.f32, components * n) for components in (9, len(SYMMETRIC), len(SYMMETRIC))]
+        is_sand = np.array([each.row.law == Law.SAND for each in self.parameters])
+        self._has_sand = bool(is_sand.any())
+        history = on_device(np.where((body < 0) & is_sand[self.owner], np.float32(APART), np.float32(0.0)))
+        self.particles = Particles(on_device(position), on_device(velocity), *rows_of, history, on_device(body), n)
         self.spacing = self.parameters[0].spacing
         self.masses, self.volume = on_device(particle_mass), volume
         self._load_particles(0)
@@ -161,13 +165,14 @@ class SoftSolver:
                 f"soft matter fills {room:.3g} cells, more than {MOST_SHARES // (PARTS * SHARES):.3g}; use a larger "
                 "cell_size"
             )
-        self._nodes = Nodes(ti.ndarray(ti.f32, room), ti.Vector.ndarray(3, ti.f32, room))
+        masses, rooms = ti.ndarray(ti.f32, room), ti.ndarray(ti.f32, room if self._has_sand else 1)
+        self._nodes = Nodes(masses, ti.Vector.ndarray(3, ti.f32, room), rooms)
         self._shares = ti.ndarray(ti.f32, PARTS * SHARES * room)
 
     def _measure(self) -> None:
         """Note how fast particles are, how hard, and whether all are finite."""
         results = measure(self.particles, self._laws, self._reduction.over(self.particles.count))
-        squared_speed, self._hardened, self._bad = self._reduction.unpack(results).tolist()
+        squared_speed, self._hardened, self._bad, self._apart = self._reduction.unpack(results).tolist()
         self._speed = math.sqrt(squared_speed)
 
     def change(self, name: str, **changes: object) -> None:
@@ -203,6 +208,7 @@ class SoftSolver:
         particles, grid = self.particles, self._grid
         if self._pouring is not None and self._pouring.let_in(particles, self._time_s):
             grid.moved(math.inf)
+            self._measure()
         self._time_s += dt
         if self._forces.accelerates:
             push_particles(particles, self._forces.now, dt)
@@ -218,8 +224,17 @@ class SoftSolver:
         if self.contacts is not None:
             self.contacts.resolve(blocks, stored, self._nodes, dt)
         stop_at_walls(blocks, stored, self._nodes, self.box, self.parameters[0].friction)
+        if self._apart > 0.0:
+            self._find_room()
         if self._find_hidden is None:
             self.end_substep(dt)
+
+    def _find_room(self) -> None:
+        """Find what walls and bodies leave of the nodes."""
+        blocks, stored, nodes = self._grid.blocks, self._grid.count, self._nodes
+        find_room(blocks, stored, nodes.mass, nodes.room, self.box)
+        if self.contacts is not None:
+            self.contacts.take_room(blocks, stored, nodes)
 
     def end_substep(self, dt: float) -> None:
         """Take velocities back from the nodes, and move for dt [s]."""
@@ -366,6 +381,7 @@ def laws_of(parameters: Sequence[SoftParameters]) -> Laws:
         least, most = 1.0 - each.value("critical_compression"), 1.0 + each.value("critical_stretch")
         power = 1.0 / (each.value("flow_exponent") or 1.0)
         flowing = 2.0 ** (0.5 - 0.5 * power) * (each.value("viscosity") / mu) ** power
-        rows.append((mu, lam, slope, tip, yielding, flowing, power, least, most, each.value("hardening")))
+        dense, hardening = DENSE * each.value("density"), each.value("hardening")
+        rows.append((dense, mu, lam, slope, tip, yielding, flowing, power, least, most, hardening))
     law = np.array([int(each.row.law) for each in parameters], dtype=np.int32)
     return Laws(on_device(law), *(on_device(np.array(column)) for column in zip(*rows, strict=True)))

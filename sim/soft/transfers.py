@@ -30,14 +30,14 @@ from sim.soft.blocks import (
     node_of,
     place_of,
 )
-from sim.soft.laws import Laws, hardened, moved_strain, respond
+from sim.soft.laws import APART, Laws, hardened, is_apart, moved_strain, respond
 from sim.soft.materials import Law
 
 SHARES = SUPPORT**3
 PARTS = 4  # of a share: mass, and momentum along x, y, z
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # what is kept of a symmetric matrix
 APIC = 4.0  # over h², the inverse of the splines' second moment
-MAXIMA, COUNTS = 2, 1  # of `measure`
+MAXIMA, COUNTS = 2, 2  # of `measure`
 AWAY = 1.0e9  # coordinate of what has left, where it is in no one's way [m]
 
 
@@ -82,6 +82,7 @@ class Nodes(NamedTuple):
 
     mass: Floats  # [kg]
     velocity: Vectors  # [m/s]
+    room: Floats  # of their volume, what walls and bodies leave, where there is sand [m³]
 
 
 @kernel
@@ -221,6 +222,18 @@ def particles_to_grid(
         nodes.velocity[n] = ti.select(mass > 0.0, momentum / ti.max(mass, 1.0e-30) + dt * gravity, ti.math.vec3(0.0))
 
 
+@func
+def density_around(hidden: ti.i32, block: ti.i32, inside: Triple, blocks: Blocks, nodes: Nodes) -> ti.f32:
+    """Density of the fullest node of a particle [kg/m³]: at a surface that is one within."""
+    most = 0.0
+    for lane in range(SHARES):
+        step = Triple(lane % SUPPORT, lane // SUPPORT % SUPPORT, lane // SUPPORT**2)
+        n = node_ahead(block, inside + step, blocks)
+        if is_hidden(hidden, lane) == 0:
+            most = ti.max(most, nodes.mass[n] / nodes.room[n])
+    return most
+
+
 @kernel
 def grid_to_particles(
     blocks: Blocks,
@@ -259,7 +272,14 @@ def grid_to_particles(
         change += 0.5 * change @ change
         b = particles.body[p]
         trial = moved_strain(symmetric_at(particles.strain, p, particles.count), change)
-        strain, stress, history = respond(trial, b, particles.history[p], dt, laws)
+        history = particles.history[p]
+        if is_apart(b, history, laws):
+            hidden = 0
+            if ti.static(parting.there):
+                hidden = parting.hidden[p]
+            is_dense = density_around(hidden, block, inside, blocks, nodes) > laws.dense[b]
+            history = ti.select(is_dense, 0.0, 2.0 * APART)  # no step takes back as much
+        strain, stress, history = respond(trial, b, history, dt, laws)
         particles.velocity[p] = velocity
         for i, j in ti.static(ti.ndrange(3, 3)):
             particles.affine[(3 * i + j) * particles.count + p] = affine[i, j]
@@ -277,10 +297,11 @@ def grid_to_particles(
 
 @kernel
 def measure(particles: Particles, laws: Laws, share: Share) -> Results:
-    """Largest squared speed [m²/s²], largest factor on the moduli [-], and how many particles are not finite."""
+    """Largest squared speed [m²/s²], largest factor on the moduli [-], numbers of particles that are not finite and of
+    sand that is apart."""
     lanes = share.tree.lanes
     for lane in range(lanes):
-        speed, factor, bad = 0.0, 1.0, 0.0
+        speed, factor, bad, apart = 0.0, 1.0, 0.0, 0.0
         for k in range(share.items):
             p = lane * share.lane_step + k * share.item_step
             if p < particles.count and particles.body[p] >= 0:
@@ -291,9 +312,11 @@ def measure(particles: Particles, laws: Laws, share: Share) -> Results:
                     finite &= is_finite(v_p[axis]) & is_finite(particles.position[p][axis])
                 bad += 1.0 - finite
                 speed = ti.max(speed, v_p.norm_sqr())
+                apart += is_apart(b, particles.history[p], laws)
                 if laws.law[b] == ti.static(int(Law.SNOW)):
                     factor = ti.max(factor, hardened(laws.hardening[b], particles.history[p]))
         share.tree.partial[lane] = speed
         share.tree.partial[lanes + lane] = factor
         share.tree.partial[2 * lanes + lane] = bad
+        share.tree.partial[3 * lanes + lane] = apart
     return reduced_tree(share.tree)
