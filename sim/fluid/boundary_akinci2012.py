@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
+SLACK = 0.985  # of the volume with which a wall would give a lattice its density: what fills a room has room to move
 DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
 
 
@@ -120,7 +121,8 @@ def domain_wall_samples(
     They are the products of lines along the axes, and weigh the products of what their coordinates do. At the usual
     support each wall ends at its own edges, and its samples lie between the particles of a lattice that fills the
     domain, as opposite to them they would hold it. Its last row, a little beyond the edge (`last_row`), gives such a
-    lattice in edges and corners the density that it has inside. A wall goes on for a row beyond an open face.
+    lattice in edges and corners nearly the density that it has inside (`SLACK`). A wall goes on for a row
+    beyond an open face.
 
     At a wide support, whose sums reach far around edges, a line has points like a lattice of fluid within the domain,
     and at either end one for each layer of the wall, which weighs as much as a sample of the layer. As the kernel is
@@ -252,8 +254,10 @@ def _layers(domain: DomainParameters, axis: int, spacing: float, support_in_spac
 
 def _calibrations(support_in_spacings: float) -> tuple[WallCalibration, ...]:
     """The layers of a wall's samples, as particles of a lattice lie beside them."""
-    is_usual = support_in_spacings == SUPPORT_IN_SPACINGS
-    return (wall_calibration(is_between=True),) if is_usual else wall_layers(support_in_spacings)
+    if support_in_spacings != SUPPORT_IN_SPACINGS:
+        return wall_layers(support_in_spacings)
+    wall = wall_calibration(is_between=True)
+    return (replace(wall, volume_in_particles=SLACK * wall.volume_in_particles),)
 
 
 @cache

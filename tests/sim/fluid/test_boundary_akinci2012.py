@@ -114,12 +114,14 @@ def test_walls_complete_the_density_in_faces_edges_and_corners(support):
     walls_near = (points < 1.0).sum(axis=1) + (points[:, :2] > size[0] - 1.0).sum(axis=1)
     # One layer of samples that goes around corners leaves 6 % too much in corners at 2 spacings, 18 % at 4, and there
     # 19 % too little in the second layer. What is left is by how much the kernel is no product of three, and at 2
-    # spacings nothing: what is too dense in a closed room stirs it.
-    wide, usual = (0.002, 0.004, 0.007, 0.015), (2.0e-4,) * 4
+    # spacings the slack that walls leave.
+    wide, usual = (0.002, 0.004, 0.007, 0.015), (1.0e-4, 0.003, 0.005, 0.0065)
     for walls, tolerance in enumerate(usual if support == SUPPORT_IN_SPACINGS else wide):
         chosen = below_the_surface & (walls_near == walls)
         assert chosen.any()
         np.testing.assert_allclose(density[chosen], 1.0, atol=tolerance)
+    if support == SUPPORT_IN_SPACINGS:  # what is too dense in a closed room stirs it
+        assert density[below_the_surface].max() < 1.0001
 
 
 def test_walls_push_a_lattice_under_even_pressure_nowhere_along_themselves():
