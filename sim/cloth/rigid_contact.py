@@ -226,7 +226,7 @@ class RigidContact(DeviceShapes):
             if motion is not None and motion.leader is not None and motion.arm is not None:
                 reach = reach + self._glue(motion.leader, motion.arm)
             mobility = inverse_mass + reach**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
-            self.pushed = pushed._replace(
+            self.pushed = self.pushed._replace(
                 may_move=int(pushed.may_move or inverse_mass.any()),
                 load_unit=LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0,
             )
