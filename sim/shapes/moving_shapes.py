@@ -79,14 +79,8 @@ def velocity_at(x: ti.math.vec3, body: ti.i32, bodies: Bodies) -> ti.math.vec3:
 
 
 @func
-def normal_of(x: ti.math.vec3, body: ti.i32, step: ti.f32, bodies: Bodies) -> ti.math.vec3:
-    """Outward normal of a body at a point of the world, of differences of half a width `step` [m]."""
-    return bodies.rotation[body] @ direction_out(in_frame(x, body, bodies), body, step, bodies.shapes)
-
-
-@func
 def direction_out(y: ti.math.vec3, shape: ti.i32, step: ti.f32, shapes: Shapes) -> ti.math.vec3:
-    """The same in the frame of a shape, at a point of it."""
+    """Outward normal of a shape at a point, in its frame, of differences of half a width `step` [m]."""
     slope = ti.math.vec3(0.0)
     for axis in ti.static(range(3)):
         offset = ti.math.vec3(0.0)
