@@ -72,18 +72,6 @@ class SceneParameters(Parameters):
         return self
 
     @model_validator(mode="after")
-    def _breaks_beside_nothing_soft(self) -> Self:
-        others = {"cloth": self.cloth, "soft matter": self.soft}
-        other = next((name for name, there in others.items() if there), None)
-        for body in self.rigid:
-            if body.whole is not None and other is not None:
-                raise KeyRefusedError(
-                    ("rigid", body.table, "breaks"),
-                    f"is of a body in a job with {other}, which would push pieces one by one; remove one of both",
-                )
-        return self
-
-    @model_validator(mode="after")
     def _has_soft_matter_beside_cloth(self) -> Self:
         """Fluid has room for one kind of sheets, samples of soft matter or of cloth."""
         if self.soft and self.cloth and self.fluid:

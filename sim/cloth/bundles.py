@@ -426,8 +426,12 @@ class PushedBodies(NamedTuple):
     inverse_inertia: Matrices  # in world axes [1/(kg m²)]
     gathered: LongIntegers  # linear and angular impulse times the step, in units, (6 b,)
     impulse: LongIntegers
-    load: LongIntegers  # sums over the contacts of a body, in `load_unit`s
+    load: LongIntegers  # sums over the contacts of a body and of all that it leads, in `load_unit`s
     load_unit: ti.f32  # [kg^(-1/2)]
+    glued: ti.template()  # whether some move as one; else what follows means nothing
+    leader: Integers  # the first of those that move as one; its own number if it is alone
+    next: Integers  # the next of those, or -1
+    arm: Vectors  # from the centre of mass of all of them to its own [m]
 
 
 @bundle

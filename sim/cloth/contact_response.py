@@ -35,6 +35,9 @@ from sim.core.warps import add_to, largest_in_warp, whole_warps
 Given = ti.types.vector(6, ti.i64)
 """What a body gets of contacts, in their units: impulse and moment."""
 
+Change = ti.types.matrix(2, 3, ti.f32)
+"""How the centre of mass of what moves as one is displaced [m], and how it is turned [rad], in rows."""
+
 AT_A_TIME = 64  # contacts whose impulses on a body a thread of a CPU sums up by itself
 
 
@@ -73,8 +76,20 @@ def body_mobility(c: ti.i32, contacts: Contacts, bodies: PushedBodies) -> ti.f32
     """Upper bound of how much a contact's point of a body moves per impulse on it [1/kg]; 0 without a body."""
     most, b = 0.0, contacts.kind[c]
     if b >= 0:
-        most = bodies.inverse_mass[b] + contacts.arm[c].norm_sqr() * ti.math.mat3(bodies.inverse_inertia[b]).norm()
+        arm = contacts.arm[c]
+        if ti.static(bodies.glued):
+            arm += bodies.arm[b]
+        most = bodies.inverse_mass[b] + arm.norm_sqr() * ti.math.mat3(bodies.inverse_inertia[b]).norm()
     return most
+
+
+@func
+def leader_of(b: ti.i32, bodies: PushedBodies) -> ti.i32:
+    """The body that stands for all that move as one with a body."""
+    leader = b
+    if ti.static(bodies.glued):
+        leader = bodies.leader[b]
+    return leader
 
 
 @ti.func
@@ -127,7 +142,7 @@ LEAST_ANSWER = 1.0e-6  # of a vertex that has a support: float32 cannot tell les
 
 
 @func
-def hold(c: ti.i32, contacts: Contacts, most: ti.f32, nodes: PushedNodes):
+def hold(c: ti.i32, contacts: Contacts, most: ti.f32, nodes: PushedNodes, bodies: PushedBodies):
     """Sum up which way the vertices of a contact are held by what stands, and pressed by a body that moves."""
     side = ti.select(most > 0.0, 3, 0)
     for k in ti.static(range(4)):
@@ -139,7 +154,7 @@ def hold(c: ti.i32, contacts: Contacts, most: ti.f32, nodes: PushedNodes):
             ti.atomic_or(nodes.between[v], ti.select(most > 0.0, PRESSED, STANDS))
             if most > 0.0:
                 ti.atomic_max(nodes.lever[v], ti.sqrt(most))
-                ti.atomic_max(nodes.pressing_body[v], contacts.kind[c])
+                ti.atomic_max(nodes.pressing_body[v], leader_of(contacts.kind[c], bodies))
 
 
 @func
@@ -268,12 +283,13 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
                         free += ti.abs(contacts.weights[c][k])
             b, most = contacts.kind[c], body_mobility(c, contacts, bodies)
             if most > 0.0:
-                ti.atomic_add(bodies.load[b], ti.cast(ti.ceil(ti.sqrt(most) / bodies.load_unit), ti.i64))
+                part = ti.cast(ti.ceil(ti.sqrt(most) / bodies.load_unit), ti.i64)
+                ti.atomic_add(bodies.load[leader_of(b, bodies)], part)
                 free = 1.0
             if is_of_vertex_and_what_stands(c, contacts, bodies):
                 ti.atomic_add(nodes.uses[2 * contacts.vertices[c][0]], 1)
             if bodies.may_move == 1 and (b >= 0 or b == WALL):
-                hold(c, contacts, most, nodes)
+                hold(c, contacts, most, nodes, bodies)
             if free >= LEAST_FREE_WEIGHT:
                 impulses.mobility[c] = 1.0
     for c in range(braced_end):
@@ -323,7 +339,7 @@ def weighed(c: ti.i32, place: ti.i32, r: Response) -> ti.f32:
             use = ti.atomic_add(nodes.uses[2 * v + 1], 1)
             impulses.used_by[use], impulses.use_weight[use] = place, contacts.weights[c][k]
     if contacts.kind[c] >= 0:
-        load = ti.cast(bodies.load[contacts.kind[c]], ti.f32) * bodies.load_unit
+        load = ti.cast(bodies.load[leader_of(contacts.kind[c], bodies)], ti.f32) * bodies.load_unit
         total += ti.sqrt(body_mobility(c, contacts, bodies)) * load
     return total
 
@@ -457,14 +473,55 @@ def move_node(i: ti.i32, momentum: ti.f32, r: Response):
 
 @func
 def move_body(b: ti.i32, momentum: ti.f32, r: Response):
-    """The same of a body."""
+    """The same of a body and of all that it leads."""
     (bodies,) = ti.static((r.bodies,))
-    shift = bodies.motion[2 * b] + (bodies.inverse_mass[b] * r.impulses.unit) * take(bodies.gathered, 6 * b)
-    turn = bodies.motion[2 * b + 1] + r.impulses.unit * (bodies.inverse_inertia[b] @ take(bodies.gathered, 6 * b + 3))
-    bodies.motion[2 * b] = shift + momentum * (shift - bodies.motion_reached[2 * b])
-    bodies.motion[2 * b + 1] = turn + momentum * (turn - bodies.motion_reached[2 * b + 1])
-    bodies.motion_reached[2 * b] = shift
-    bodies.motion_reached[2 * b + 1] = turn
+    if leader_of(b, bodies) == b:
+        change = moved_by(b, r)
+        number = b
+        while number >= 0:
+            shift = bodies.motion[2 * number] + shift_of(number, change, bodies)
+            turn = bodies.motion[2 * number + 1] + change[1, :]
+            bodies.motion[2 * number] = shift + momentum * (shift - bodies.motion_reached[2 * number])
+            bodies.motion[2 * number + 1] = turn + momentum * (turn - bodies.motion_reached[2 * number + 1])
+            bodies.motion_reached[2 * number] = shift
+            bodies.motion_reached[2 * number + 1] = turn
+            number = next_of(number, bodies)
+
+
+@func
+def moved_by(b: ti.i32, r: Response) -> Change:
+    """How what a body and all that it leads have gathered, which is nothing then, moves them."""
+    (bodies,) = ti.static((r.bodies,))
+    push, twist = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    number = b
+    while number >= 0:
+        own = take(bodies.gathered, 6 * number)
+        push += own
+        twist += take(bodies.gathered, 6 * number + 3)
+        if ti.static(bodies.glued):
+            twist += bodies.arm[number].cross(own)
+        number = next_of(number, bodies)
+    shift = (bodies.inverse_mass[b] * r.impulses.unit) * push
+    turn = r.impulses.unit * (bodies.inverse_inertia[b] @ twist)
+    return ti.Matrix.rows([shift, turn])
+
+
+@func
+def shift_of(b: ti.i32, change: Change, bodies: PushedBodies) -> ti.math.vec3:
+    """How far the centre of mass of a body moves with all that moves as one with it [m]."""
+    shift = change[0, :]
+    if ti.static(bodies.glued):
+        shift += change[1, :].cross(bodies.arm[b])
+    return shift
+
+
+@func
+def next_of(b: ti.i32, bodies: PushedBodies) -> ti.i32:
+    """The next of those that move as one, or -1."""
+    following = -1
+    if ti.static(bodies.glued):
+        following = bodies.next[b]
+    return following
 
 
 @ti.func
@@ -501,15 +558,20 @@ def finish_push(count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Resp
 
 @func
 def leave_body(b: ti.i32, r: Response):
-    """Motion of a body as the impulses of an iteration make it."""
+    """Motion of a body and of all that it leads as the impulses of an iteration make it."""
     (bodies,) = ti.static((r.bodies,))
-    for axis in ti.static(range(6)):
-        bodies.impulse[6 * b + axis] += bodies.gathered[6 * b + axis]
-    bodies.motion[2 * b] = bodies.motion_start[2 * b] + (bodies.inverse_mass[b] * r.impulses.unit) * take(
-        bodies.gathered, 6 * b
-    )
-    twist = r.impulses.unit * take(bodies.gathered, 6 * b + 3)
-    bodies.motion[2 * b + 1] = bodies.motion_start[2 * b + 1] + bodies.inverse_inertia[b] @ twist
+    if leader_of(b, bodies) == b:
+        number = b
+        while number >= 0:
+            for axis in ti.static(range(6)):
+                bodies.impulse[6 * number + axis] += bodies.gathered[6 * number + axis]
+            number = next_of(number, bodies)
+        change = moved_by(b, r)
+        number = b
+        while number >= 0:
+            bodies.motion[2 * number] = bodies.motion_start[2 * number] + shift_of(number, change, bodies)
+            bodies.motion[2 * number + 1] = bodies.motion_start[2 * number + 1] + change[1, :]
+            number = next_of(number, bodies)
 
 
 TOLERANCE = 0.02  # part of their thickness by which contacts may miss what they should keep

@@ -87,8 +87,10 @@ class BodyMotion:
         velocity: of the centres of mass [m/s], (m, 3).
         angular_velocity: about world axes [rad/s], (m, 3).
         acceleration: that the coming substep will add, but for cloth [m/s²], (m, 3).
-        inverse_mass: [1/kg], (m,); 0 for what no force moves.
-        inverse_inertia: in world axes [1/(kg m²)], (m, 3, 3).
+        inverse_mass: of all that moves as one with a body [1/kg], (m,); 0 for what no force moves.
+        inverse_inertia: the same, about the common centre of mass, in world axes [1/(kg m²)], (m, 3, 3).
+        leader: of each body the first of those that move as one, (m,); None where each moves on its own.
+        arm: from the common centre of mass to its own, in world axes [m], (m, 3).
     """
 
     velocity: Array
@@ -96,6 +98,8 @@ class BodyMotion:
     acceleration: Array
     inverse_mass: Array
     inverse_inertia: Array
+    leader: NDArray[np.int64] | None = None
+    arm: Array | None = None
 
 
 class RigidContact(DeviceShapes):
@@ -138,7 +142,7 @@ class RigidContact(DeviceShapes):
         twice = {name: ti.Vector.ndarray(3, ti.f32, 2 * max(b, 1)) for name in ("motion_start", "motion_reached")}
         six = {name: ti.ndarray(ti.i64, 6 * max(b, 1)) for name in ("gathered", "impulse")}
         self.pushed: PushedBodies = with_room(
-            PushedBodies, b, may_move=0, count=b, motion=motion, load_unit=1.0, **twice, **six
+            PushedBodies, b, may_move=0, count=b, motion=motion, load_unit=1.0, glued=False, **twice, **six
         )
         self.set_friction(np.asarray(friction, dtype=np.float64))
         self._motion: BodyMotion | None = None
@@ -218,11 +222,29 @@ class RigidContact(DeviceShapes):
             put(colliding.rotation, poses.rotation[:b])
             put(pushed.inverse_mass, inverse_mass)
             put(pushed.inverse_inertia, inverse_inertia)
-            mobility = inverse_mass + self._radius**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
-            self.pushed = pushed._replace(
+            reach = self._radius
+            if motion is not None and motion.leader is not None and motion.arm is not None:
+                reach = reach + self._glue(motion.leader, motion.arm)
+            mobility = inverse_mass + reach**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
+            self.pushed = self.pushed._replace(
                 may_move=int(pushed.may_move or inverse_mass.any()),
                 load_unit=LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0,
             )
+
+    def _glue(self, leader: NDArray[np.int64], arm: Array) -> Array:
+        """Say which bodies move as one, as of `BodyMotion`; returns the lengths of all arms [m], (b,)."""
+        m, leaders, following = len(leader), np.arange(self.count), np.full(self.count, -1)
+        leaders[:m] = leader
+        in_turn = np.argsort(leaders, kind="stable")
+        alike = leaders[in_turn[1:]] == leaders[in_turn[:-1]]
+        following[in_turn[:-1][alike]] = in_turn[1:][alike]
+        arms = np.zeros((self.count, 3))
+        arms[:m] = arm
+        self.pushed = self.pushed._replace(glued=True)
+        for array, values in ((self.pushed.leader, leaders), (self.pushed.next, following), (self.pushed.arm, arms)):
+            put(array, values)
+        lengths: Array = np.linalg.norm(arms, axis=1)
+        return lengths
 
     def begin_substep(self, dt: float) -> None:
         """Foresee how the bodies move in a substep of dt [s] that cloth does not push."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +33,8 @@ class ClothRigidCoupling(Coupling):
     A coupled step: contacts of the cloth's substep foresee how bodies move in it, gravity included, and push both sides
     in every iteration, so that light bodies answer within the step; the bodies take the impulses, then gravity and
     contacts among themselves, and move; the cloth's contacts follow. Impulses are opposite contact by contact: linear
-    and angular momentum are kept to rounding. Kinematic bodies push and feel nothing.
+    and angular momentum are kept to rounding. Kinematic bodies push and feel nothing. Pieces of a body that breaks are
+    felt one by one and move as what they are glued to; what each gets stresses the others.
 
     Approximate: contacts among bodies in the same step are not foreseen. Cloth carries a heavy body over what stands
     (`sim.cloth.contact_response`), in two layers, too, but gives way between two bodies that both move, or in more.
@@ -54,7 +56,7 @@ class ClothRigidCoupling(Coupling):
         """Tell the cloth's contacts where the bodies are after a substep of dt [s]; 0 before the first."""
         from sim.cloth.rigid_contact import BodyMotion
 
-        bodies = self._rigid.bodies
+        bodies, glue = self._rigid.bodies, self._rigid.glue
         motion = BodyMotion(
             velocity=bodies.velocity,
             angular_velocity=bodies.angular_velocity,
@@ -62,6 +64,14 @@ class ClothRigidCoupling(Coupling):
             inverse_mass=bodies.inverse_mass,
             inverse_inertia=bodies.inverse_inertia(),
         )
+        if glue is not None:
+            motion = replace(
+                motion,
+                inverse_mass=glue.movers.inverse_mass[glue.leader],
+                inverse_inertia=glue.movers.inverse_inertia()[glue.leader],
+                leader=glue.leader,
+                arm=bodies.position - glue.movers.position[glue.leader],
+            )
         self._contacts.rigid.place(self._rigid.poses(), motion, self._rigid.time_s)
 
     def resume(self) -> None:

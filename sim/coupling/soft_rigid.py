@@ -37,11 +37,16 @@ def contacts_of_soft(
         return None
     still = [BodyGeometry.of(body.solid) for body in static]
     geometries = [*(() if rigid is None else rigid.solids), *still]
+    glue = None if rigid is None else rigid.glue
+    whole_of = np.full(len(geometries), -1)
+    for number, whole in enumerate(() if glue is None else glue.wholes):
+        whole_of[whole.pieces] = number
+    wholes = [] if glue is None else [BodyGeometry.of(whole.solid()) for whole in glue.wholes]
     own, glued = soft.parameters[0].friction, {*soft.parameters[0].sticks_to}
     friction = [
         STICKS if glued & {body.name, body.group} else math.sqrt(own * body.friction) for body in (*moving, *standing)
     ]
-    contacts = BodyContacts(geometries, len(moving), friction, mass)
+    contacts = BodyContacts(geometries, len(moving), friction, mass, wholes=wholes, whole_of=whole_of)
     rotation = np.array([body.solid.rotation for body in static]).reshape(-1, 3, 3)
     position = np.array([body.solid.position for body in static]).reshape(-1, 3)
     centre = np.array([geometry.centre_of_mass for geometry in still]).reshape(-1, 3)
@@ -54,7 +59,7 @@ class SoftRigidCoupling(Coupling):
 
     A coupled step: soft matter meets the bodies where they are, and they get what its nodes lost; they take it in with
     gravity and contacts, and move. Linear and angular momentum are kept to rounding. Kinematic bodies push and feel
-    nothing.
+    nothing. What pieces of a body that breaks get, each for itself, stresses the faces between them.
     """
 
     def __init__(self, soft: SoftSolver, rigid: RigidSolver, contacts: BodyContacts) -> None:
@@ -73,6 +78,7 @@ class SoftRigidCoupling(Coupling):
 
     def resume(self) -> None:
         """As `follow`."""
-        rigid, bodies = self._rigid, self._rigid.bodies
+        rigid, bodies, glue = self._rigid, self._rigid.bodies, self._rigid.glue
         motion = bodies.position, bodies.rotation(), bodies.velocity, bodies.angular_velocity
-        self._contacts.move(*motion, rigid.time_s, rigid.mobility())
+        together = None if glue is None else (glue.leader, glue.movers.position[glue.leader])
+        self._contacts.move(*motion, rigid.time_s, rigid.mobility(), together)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from sim.shapes.assembly import Assembly
 from sim.shapes.balls import Balls, exact_balls, surface_balls
 from sim.shapes.convex_pieces import convex_pieces
-from sim.shapes.distance_grids import sampled_distances
+from sim.shapes.distance_grids import CELLS_PER_WALL, sampled_distances
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, mass_properties_of_solid
 from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
-from sim.shapes.parameters import AnimationShape, BallastParameters, WeightedPlacement
+from sim.shapes.parameters import AnimationShape, BallastParameters, PieceShape, WeightedPlacement
 from sim.shapes.placement import PlacedSolid, build_solid
 from sim.shapes.solid import Points
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh; half of them in a convex piece of one
 GRID_PADDING = 0.1  # how far a distance grid reaches past its mesh, in longest edges
+PIECE_CELLS = 32  # cells along the longest edge of a piece of a body that breaks, as cloth and smoke meet it
 
 
 class BodyGeometry:
@@ -41,7 +42,9 @@ class BodyGeometry:
     def __init__(self, parameters: WeightedPlacement) -> None:
         """Build the shape; raises ShapeError where that is impossible, or it is too thin to have an inside."""
         placed = build_solid(parameters)
-        self.deformation = _deformation_of(parameters, placed)
+        self.deformation, self._piece = _deformation_of(parameters, placed), None
+        if isinstance(parameters.shape, PieceShape):
+            self._piece = parameters.shape
         # Without ballast the centre is that of the shape, and bodies without mass have one too.
         self._take(placed, parameters.ballast, parameters.density or 1.0)
 
@@ -49,7 +52,7 @@ class BodyGeometry:
     def of(cls, placed: PlacedSolid) -> BodyGeometry:
         """That of a solid without ballast, wherever it is."""
         geometry = cls.__new__(cls)
-        geometry.deformation = None
+        geometry.deformation = geometry._piece = None
         geometry._take(placed, (), 1.0)
         return geometry
 
@@ -163,8 +166,18 @@ class BodyGeometry:
 
     @cached_property
     def fine_grid(self) -> LevelSet:
-        """Distances of a mesh as cloth and smoke read them, in the frame of `solid`."""
-        return sampled_distances(self.solid)
+        """Distances of a mesh as cloth and smoke read them, in the frame of `solid`.
+
+        Of a piece as fine as its whole's walls need; its own edges, however sharp, count as thin walls of others.
+        """
+        if self._piece is None:
+            return sampled_distances(self.solid)
+        from sim.shapes.cutting import cut_of
+
+        longest = float(np.max(self.bounds[1] - self.bounds[0]))
+        return sampled_distances(
+            self.solid, min(longest / PIECE_CELLS, self.solid.scale * cut_of(self._piece).wall / CELLS_PER_WALL)
+        )
 
 
 def _deformation_of(parameters: WeightedPlacement, placed: PlacedSolid) -> Deformation | None:

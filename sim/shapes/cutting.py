@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Voronoi
 
 from sim.shapes.assembly import BODY_PART, Assembly, manifold_of, mesh_of
+from sim.shapes.distance_grids import thin_wall
 from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
 from sim.shapes.parameters import CompoundShape, MeshShape, PieceShape, Shape
 from sim.shapes.placement import PlacedSolid, build_rest_shape
@@ -47,6 +48,12 @@ class Cut:
 
     pieces: tuple[RestShape, ...]
     faces: tuple[TouchingFace, ...]
+    whole: RestShape
+
+    @cached_property
+    def wall(self) -> float:
+        """How thick the walls of the whole are [m]; see `distance_grids.thin_wall`."""
+        return thin_wall(PlacedSolid(self.whole, 1.0, np.eye(3), np.zeros(3)))
 
 
 def build_piece(shape: PieceShape) -> RestShape:
@@ -101,7 +108,7 @@ def _cut(of: Shape, count: int | None, seed: int, _files: tuple[tuple[int, int],
         pieces.append(build_rest_shape(CompoundShape(type="compound", part=(alone,))))
     meshes = [_with_inside(piece.surface_mesh(None)) for piece in pieces]
     size = float(np.max(np.ptp(np.concatenate([mesh.vertices for mesh in meshes]), axis=0)))
-    return Cut(tuple(pieces), tuple(_touching(meshes, size)))
+    return Cut(tuple(pieces), tuple(_touching(meshes, size)), build_rest_shape(of))
 
 
 def _with_inside(mesh: TriangleMesh) -> TriangleMesh:
@@ -133,7 +140,7 @@ def _voronoi_cut(whole: RestShape, count: int, seed: int) -> Cut:
             warnings = (f"piece {number + 1} of {count} is in {alone} parts, {remedy}",)
         pieces.append(Assembly(surface, warnings=warnings, solids=(hull_of(surface.vertices),)))
         meshes.append(surface)
-    return Cut(tuple(pieces), tuple(_touching(meshes, size)))
+    return Cut(tuple(pieces), tuple(_touching(meshes, size)), whole)
 
 
 def hull_of(points: Array) -> PlacedSolid:

@@ -24,9 +24,9 @@ TOUCHING = 0.9  # share of its radius that a ball must have around its middle: f
 HALVINGS = 14  # of the interval of radii, which starts with half the longest edge of the bounding box
 
 
-def sampled_distances(solid: PlacedSolid) -> LevelSet:
-    """The grid of a mesh, fine enough for its walls."""
-    cell = grid_spacing(solid, thin_wall(solid))
+def sampled_distances(solid: PlacedSolid, cell: float | None = None) -> LevelSet:
+    """The grid of a mesh of cells with an edge [m], or fine enough for its walls."""
+    cell = grid_spacing(solid, thin_wall(solid)) if cell is None else cell
     is_exact = _node_count(np.ptp(solid.bounds, axis=0), cell) <= EXACT_NODES
     within = np.inf if is_exact else EXACT_WITHIN * cell
     return LevelSet.sample(solid, cell, padding=GRID_PADDING * cell, exact_within=within)

@@ -79,12 +79,11 @@ def velocity_at(x: ti.math.vec3, body: ti.i32, bodies: Bodies) -> ti.math.vec3:
 
 
 @func
-def normal_of(x: ti.math.vec3, body: ti.i32, step: ti.f32, bodies: Bodies) -> ti.math.vec3:
-    """Outward normal of a body at a point of the world, of differences of half a width `step` [m]."""
-    y = in_frame(x, body, bodies)
+def direction_out(y: ti.math.vec3, shape: ti.i32, step: ti.f32, shapes: Shapes) -> ti.math.vec3:
+    """Outward normal of a shape at a point, in its frame, of differences of half a width `step` [m]."""
     slope = ti.math.vec3(0.0)
     for axis in ti.static(range(3)):
         offset = ti.math.vec3(0.0)
         offset[axis] = step
-        slope[axis] = distance_to(y + offset, body, bodies.shapes) - distance_to(y - offset, body, bodies.shapes)
-    return bodies.rotation[body] @ (slope / ti.max(slope.norm(), 1.0e-30))
+        slope[axis] = distance_to(y + offset, shape, shapes) - distance_to(y - offset, shape, shapes)
+    return slope / ti.max(slope.norm(), 1.0e-30)

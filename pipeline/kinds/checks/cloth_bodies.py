@@ -17,6 +17,7 @@ from sim.cloth.start import path_of_pin
 from sim.core.motion import rotation
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
+from sim.shapes.parameters import PieceShape
 from sim.shapes.placement import PlacedSolid
 
 # A body whose shortest side has fewer edges of the cloth may show between its nodes, and pass with less than half.
@@ -54,7 +55,8 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
         if too_coarse:
             coarsest = max(too_coarse, key=lambda start: start.longest_edge)
             thin.setdefault(body.group, []).append((thickness, body.name, coarsest))
-        if problem := thin_wall_problem(solid, who="cloth", what="cloth"):
+        met = _met_by_a_grid(body, solid)
+        if met is not None and (problem := thin_wall_problem(met, who="cloth", what="cloth")):
             findings.warn((*path[:2], "shape"), problem)
     for bodies in thin.values():
         thickness, name, coarsest = min(bodies, key=lambda each: each[0])
@@ -65,6 +67,17 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
             f"{coarsest.longest_edge:.3g} m each{others}: it may show or pass between the nodes; divide the sheet "
             "more finely, or make the body larger",
         )
+
+
+def _met_by_a_grid(body: RigidBodyParameters, solid: PlacedSolid) -> PlacedSolid | None:
+    """What the walls are of that cloth has to feel: of the first of the pieces of a body the whole, of others none."""
+    from sim.shapes.cutting import cut_of
+
+    if not isinstance(body.shape, PieceShape):
+        return solid
+    if body.shape.number > 1:
+        return None
+    return PlacedSolid(cut_of(body.shape).whole, solid.scale, solid.rotation, solid.position)
 
 
 @dataclass(frozen=True, eq=False)

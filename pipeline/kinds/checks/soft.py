@@ -68,7 +68,7 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
     if job.soft and job.fluid:
         _check_fluid(job.soft[0], job.fluid[0].spacing, findings)
     if job.soft:
-        _check_bodies(solids, job.soft[0].cell_size, findings)
+        _check_bodies(job, solids, job.soft[0].cell_size, findings)
     return total
 
 
@@ -120,13 +120,27 @@ def _check_fluid(soft: SoftParameters, spacing: float, findings: Findings) -> No
         )
 
 
-def _check_bodies(solids: Solids, cell_size: float, findings: Findings) -> None:
-    """Warn of bodies that nodes of the grid could miss."""
+def _check_bodies(job: Job, solids: Solids, cell_size: float, findings: Findings) -> None:
+    """Warn of bodies that nodes of the grid could miss, of the pieces of one that breaks of the thinnest."""
+    shards: dict[str, list[tuple[float, KeyPath]]] = {}
     for path, solid in solids.items():
         thin = float(np.min(np.ptp(solid.bounds, axis=0)))
-        if path[0] == "rigid" and thin < FEWEST_CELLS * cell_size:
-            findings.warn(
-                path,
-                f"is {thin:.3g} m thin, less than {FEWEST_CELLS:g} cells of soft matter, {cell_size:g} m, which may "
-                f"pass through it; use soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or a thicker body",
-            )
+        if path[0] != "rigid" or thin >= FEWEST_CELLS * cell_size:
+            continue
+        whole = job.rigid[int(path[1])].whole
+        if whole is not None:
+            shards.setdefault(whole, []).append((thin, path))
+            continue
+        findings.warn(
+            path,
+            f"is {thin:.3g} m thin, less than {FEWEST_CELLS:g} cells of soft matter, {cell_size:g} m, which may "
+            f"pass through it; use soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or a thicker body",
+        )
+    for whole, found in shards.items():
+        thin, path = min(found)
+        findings.warn(
+            (*path[:2], "breaks"),
+            f'"{whole}" has pieces, {len(found)} in all, of less than {FEWEST_CELLS:g} cells of soft matter, '
+            f"{cell_size:g} m, the thinnest of {thin:.3g} m: it may pass through them once they have broken off; use "
+            f"soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or fewer pieces",
+        )

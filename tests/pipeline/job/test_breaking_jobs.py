@@ -109,3 +109,32 @@ def test_a_scene_of_pieces_and_compounds_steps(tmp_path):
     assert set(read) == {"pot_1", "pot_2", "pot_3", "hammer"}
     for key, array in written["pot_2"].arrays.items():
         assert np.array_equal(read["pot_2"].arrays[key], array)
+
+
+CLOTH = """
+[[cloth]]
+name = "sheet"
+shape = { type = "rectangle", size = [1.0, 1.0], counts = [21, 21] }
+position = [0.0, 0.0, 0.8]
+"""
+CLAY = """
+[[soft]]
+name = "clay"
+material = "clay"
+cell_size = 0.04
+block = [{ shape = { type = "box", size = [0.6, 0.6, 0.2] }, position = [0.0, 0.0, 0.1] }]
+"""
+
+
+@pytest.mark.parametrize(
+    ("other", "place", "told"),
+    [(CLOTH, "cloth[0].shape", "more of its group are thin"), (CLAY, "rigid[0].breaks", '"pot" has pieces, ')],
+)
+def test_pieces_that_cloth_or_soft_matter_may_pass_through_are_told_once(tmp_path, other, place, told):
+    """Not one by one, and nothing of walls: edges of pieces are sharp, those of the whole are not."""
+    pot = POT.format(shape='{ type = "box", size = [0.2, 0.2, 0.2] }').replace("pieces = 3", "pieces = 12")
+    found = checked(ROOM + pot + other, tmp_path / "broken.toml")
+    assert not found.errors
+    (warning,) = [each for each in found.warnings if told in each]
+    assert place in warning
+    assert not [each for each in found.warnings if "walls" in each]

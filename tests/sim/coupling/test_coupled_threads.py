@@ -3,10 +3,16 @@
 import pytest
 from cloth_tanks import EDGES, ClothTank, rectangle
 from coupled_tanks import Tank
+from test_breaking_in_cloth import BREAKS as BREAKS_ON_A_SHEET
+from test_breaking_in_cloth import hits_a_sheet
+from test_breaking_in_soft_matter import BREAKS as BREAKS_ON_JELLY
+from test_breaking_in_soft_matter import hits_jelly
 from thread_counts import digest_of, result_on_any_threads
 
 from sim.build import build_world
 from sim.core.domain import DomainParameters
+from sim.core.world import World
+from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -56,8 +62,27 @@ def water_on_cloth() -> tuple[str, float]:
     return digest_of(tank.world.checkpoint()), float(abs(tank.coupling.impulse()).max())
 
 
+def broken(world: World, frames: int) -> tuple[str, float]:
+    """Returns how many faces have broken in place of a push."""
+    for _ in range(frames):
+        world.advance_frame()
+    rigid = world.solvers["rigid"]
+    assert isinstance(rigid, RigidSolver)
+    assert rigid.glue is not None
+    return digest_of(world.checkpoint()), float(rigid.glue.is_broken.sum())
+
+
 def coupled_digests() -> list[tuple[str, float]]:
     return [ball_in_water("wcsph"), ball_in_water("pcisph"), dye_poured_on_a_ball(), water_on_cloth()]
+
+
+def broken_digests() -> list[tuple[str, float]]:
+    return [broken(hits_a_sheet(BREAKS_ON_A_SHEET, density=1000.0), 2), broken(hits_jelly(BREAKS_ON_JELLY), 4)]
+
+
+@pytest.mark.slow
+def test_what_breaks_on_cloth_and_on_soft_matter_does_not_depend_on_the_number_of_threads():
+    assert min(effect for _, effect in result_on_any_threads(broken_digests)) > 0.0
 
 
 @pytest.mark.slow

@@ -7,13 +7,11 @@ import pytest
 from pydantic import ValidationError
 from rigid_scenes import SPACE, advance, ball, body, cube, in_room, in_space, totals
 
-from sim.core.parameters import KeyRefusedError
 from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters, joint_problems
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import start_problems
-from sim.scene import SceneParameters
 from sim.shapes.body_geometry import BodyGeometry
 
 LENGTH, EDGE, DENSITY = 1.0, 0.1, 2000.0
@@ -300,20 +298,11 @@ def test_what_cannot_break_is_refused(keys, path):
     assert refused.value.errors()[0]["ctx"]["error"].path == path
 
 
-def test_joints_fluids_and_cloths_do_not_go_with_what_breaks():
-    breaks = {"strength": 1e6, "pieces": 2}
-    pieces = with_groups((body("pot", cube(0.1), breaks=breaks),))
+def test_joints_do_not_go_with_what_breaks():
+    pieces = with_groups((body("pot", cube(0.1), breaks={"strength": 1e6, "pieces": 2}),))
     joint = JointParameters(name="nail", kind="ball", between=("pot_1",), anchor=(0.0, 0.0, 0.0))
     (problem,) = joint_problems([joint], pieces)
     assert "pot_1" in problem.text
-    sheet = {"type": "rectangle", "size": (0.4, 0.4), "counts": (5, 5)}
-    with pytest.raises(ValidationError) as refused:
-        SceneParameters.model_validate(
-            {"rigid": (body("pot", cube(0.1), breaks=breaks),), "cloth": ({"name": "flag", "shape": sheet},)}
-        )
-    error = refused.value.errors()[0]["ctx"]["error"]
-    assert isinstance(error, KeyRefusedError)
-    assert error.path == ("rigid", 0, "breaks")
 
 
 def test_loads_that_cannot_be_shared_are_as_the_contacts_have_them_and_are_counted(monkeypatch):
