@@ -8,11 +8,9 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir, push_nodes
-from sim.cloth.cells import cells_of
 from sim.cloth.continuous_contacts import ContinuousContacts, SpringTurns
-from sim.cloth.device_cells import DeviceCells
-from sim.cloth.device_springs import DeviceSprings
-from sim.cloth.explicit import ExplicitSprings
+from sim.cloth.device_springs import DeviceCells, DeviceSprings
+from sim.cloth.integrators import ExplicitSprings, XPBDSprings
 from sim.cloth.parameters import (
     DEFAULT_SUBSTEPS,
     MOST_REFINED,
@@ -23,11 +21,10 @@ from sim.cloth.parameters import (
 )
 from sim.cloth.pins import Pins
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
+from sim.cloth.springs import ACCURATE_SHARE, cells_of, joined, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths, Load, finish_step
 from sim.cloth.totals import ClothTotals
-from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
 from sim.core.host_access import add, copied, viewed
 from sim.core.parameters import Vector3
@@ -54,8 +51,7 @@ class ClothSolver:
     """All cloths of a scene, as they share their substeps and collide with each other.
 
     One substep: pins move; gravity and air accelerate the nodes, and explicit springs; compliant springs, then contacts
-    correct where that leads; velocities and positions follow from where nodes end up. Every node has its share of the
-    sheet's mass (lumped), every triangle its share of the air.
+    correct where that leads; velocities and positions follow from where nodes end up.
 
     Attributes:
         state: of all nodes.
@@ -215,9 +211,8 @@ class ClothSolver:
     def stable_dt(self) -> float:
         """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear.
 
-        Of cloths for which no number of substeps is given, a fraction of that while their springs are longer than their
-        tension makes them by what contacts do: what these push out and springs pull back in does not settle in long
-        steps, and gains energy.
+        Of cloths for which no number of substeps is given, a fraction of that while contacts leave their springs longer
+        than their tension makes them.
         """
         dt = min(self._asked_dt, self._free_dt / self._refinement)
         return dt if self.contacts is None else self.contacts.stable_dt(dt)
@@ -244,8 +239,7 @@ class ClothSolver:
         """Springs and contacts in turns, and where they lead; as these leave springs too long, the next step has more
         sweeps, or is shorter.
 
-        One sweep, and no measure of springs by themselves, of a cloth that is given `substeps`: these are what it pays
-        for. Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
+        Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
         shortened for those that omit `substeps`.
         """
         state, integrator = self.state, self._integrator

@@ -89,9 +89,8 @@ class ClothState:
     """Nodes, triangles and edges; n nodes, k triangles, e edges, b cloths.
 
     A substep starts at `lattice` times `quantum`, and `displacement` leads to where it ends; springs and contacts
-    change only that. What the lattice cannot hold of a displacement waits in `carry` and is part of the next one. So
-    neither velocities nor lengths of springs feel the rounding of positions, however short the step; float32 positions
-    of cloth a metre off the origin move in jumps of 0.1 um, 1 mm/s in a step of 0.1 ms.
+    change only that. What the lattice cannot hold of a displacement waits in `carry` and is part of the next one: so
+    neither velocities nor lengths of springs feel the rounding of positions.
 
     Attributes:
         host: what they started with, on the host.
@@ -221,11 +220,9 @@ def move_pinned(
 def finish_step(nodes: Nodes, position: Vectors, limit: ti.i32, dt: ti.f32, reasons: Integers):
     """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
 
-    A velocity changes by what the displacement differs from dt times itself: the same as the displacement over dt, but
-    for the rounding of 1/dt, which would make all velocities grow or shrink alike. Nodes stop at the ends of the
-    lattice. Where a displacement is not finite, the velocity shows it.
-
-    Nothing is done unless the three `reasons` why the substep may not be over are 0.
+    A velocity changes by what the displacement differs from dt times itself, as the rounding of 1/dt would make all
+    velocities grow or shrink alike. Nodes stop at the ends of the lattice. Where a displacement is not finite, the
+    velocity shows it. Nothing is done unless the three `reasons` why the substep may not be over are 0.
     """
     end = ti.select(reasons[0] + reasons[1] + reasons[2] == 0, position.shape[0], 0)
     for i in range(end):

@@ -3,9 +3,17 @@
 import taichi as ti
 
 from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, TriangleSystem, TriangleWork
-from sim.cloth.cells import OWN_SHARE, TRIANGLE
-from sim.cloth.device_cells import DeviceCells, change_of, derivative, mean_strain, shear_of, strain_by, tension_of
-from sim.cloth.device_springs import TINY_LENGTH
+from sim.cloth.device_springs import (
+    TINY_LENGTH,
+    DeviceCells,
+    change_of,
+    derivative,
+    mean_strain,
+    shear_of,
+    strain_by,
+    tension_of,
+)
+from sim.cloth.springs import OWN_SHARE, TRIANGLE
 from sim.cloth.state import ClothState
 from sim.cloth.threads import LARGEST_RESIDUAL, STRAIGHTENED, direction_of
 from sim.core.arrays import Floats, Vectors
@@ -36,11 +44,8 @@ class TriangleSolver:
     Forces push along the directions of the start, as threads do (`threads`), so that K consists of the stiffnesses
     along these, and of Newmark's beta of the tension that turns with them. Damping is part of both. Conjugate gradients
     with the inverse 3 x 3 blocks B of the nodes (Baraff & Witkin 1998, "Large steps in cloth simulation"), with one
-    reduction an iteration (Chronopoulos & Gear 1989). They start from the multiple of the displacement of the step
-    before that leaves the least energy: what rests stays at rest, however few they are. Their number falls with dt: a
-    wave crosses dt (E/rho)^(1/2) in a step, 14 edges of 1 cm of cotton.
-
-    What iterations leave of linear momentum is taken from each piece of a mesh that no pin holds.
+    reduction an iteration (Chronopoulos & Gear 1989), start from the multiple of the displacement of the step before
+    that leaves the least energy. What they leave of linear momentum is taken from each piece that no pin holds.
 
     Attributes:
         cloths: numbers of those that they belong to.
