@@ -147,12 +147,16 @@ class XPBDSprings:
         state: what they move.
         springs: all springs.
         cells: all cells.
+
+    Attributes:
+        last_dt: length of the last step [s], 0 before the first; `usual_dt` of those that are not shortened.
     """
 
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
         self._state = state
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
+        self.last_dt = self._rate_before = self.usual_dt = 0.0
         self._bends = [family for family in springs if family.arity > PAIR]
         self._shears = [family for family in cells if family.arity != TRIANGLE]
         self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
@@ -209,8 +213,10 @@ class XPBDSprings:
             for bounds in bends.colours:
                 numbers = dt * dt, 1.0 / dt, bends.arity, bends.at_once
                 solve_bends(bends.on_device, bounds, self._state.nodes, *numbers)
+        self._rate_before = 1.0 / self.last_dt if self.last_dt else 0.0
         for sweep in range(sweeps.max()):
             self.sweep(dt, sweeps > sweep, shears=self._shears, is_first=sweep == 0)
+        self.last_dt = dt
         for threads in self._threads:
             threads.straighten(self._state, dt)
         self._momentum.restore(dt)
@@ -224,13 +230,14 @@ class XPBDSprings:
         for cells in shears:
             if not cloths[list(cells.cloths)].any():
                 continue
-            solve_shears(cells.on_device, cells.bounds, self._state.nodes, dt * dt, int(is_first), cells.colours)
+            steps = ti.math.vec3(dt, self._rate_before, (self.usual_dt / dt) ** 2)
+            solve_shears(cells.on_device, cells.bounds, self._state.nodes, steps, int(is_first), cells.colours)
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
                 threads.displace(self._state, dt, is_first=is_first)
         for triangles in self._triangles:
             if cloths[list(triangles.cloths)].any():
-                triangles.displace(dt, is_first=is_first)
+                triangles.displace(dt, self._rate_before, is_first=is_first)
 
 
 @func
@@ -306,6 +313,8 @@ class ExplicitSprings:
     Forces of springs are stored, and each node gathers its own in a fixed order.
     """
 
+    last_dt = usual_dt = 0.0  # as of `XPBDSprings`; nothing depends on them
+
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
         self._state, self._springs, self._cells = state, springs, cells
         counts = [family.count for family in springs] + [2 * family.count for family in cells]
@@ -353,9 +362,7 @@ class ExplicitSprings:
         for first, cells in zip(self._first[len(self._springs) :], self._cells, strict=False):
             cells.measure_strains(state.nodes, is_damped=True)
             compute_cell_forces(cells.on_device, state.nodes, int(first), cells.arity, self._force)
-        gather_spring_forces(
-            self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
-        )
+        gather_spring_forces(self._start, self._spring, self._coefficient, self._force, dt, state.nodes)
 
     def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
         """Displacements follow from velocities alone."""
@@ -382,17 +389,11 @@ def compute_spring_forces(springs: SpringArrays, nodes: Nodes, first: ti.i32, ar
 
 @kernel
 def gather_spring_forces(
-    start: Integers,
-    spring: Integers,
-    coefficients: Floats,
-    force: Vectors,
-    inverse_mass: Floats,
-    dt: ti.f32,
-    velocity: Vectors,
+    start: Integers, spring: Integers, coefficients: Floats, force: Vectors, dt: ti.f32, nodes: Nodes
 ):
     """Accelerate every node by its springs."""
-    for i in range(velocity.shape[0]):
+    for i in range(nodes.velocity.shape[0]):
         total = ti.math.vec3(0.0)
         for k in range(start[i], start[i + 1]):
             total += coefficients[k] * force[spring[k]]
-        velocity[i] += dt * inverse_mass[i] * total
+        nodes.velocity[i] += dt * nodes.inverse_mass[i] * total

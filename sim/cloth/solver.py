@@ -18,6 +18,7 @@ from sim.cloth.parameters import (
     RUNAWAY_SPEED,
     ClothParameters,
     shared_conflicts,
+    substeps_of,
 )
 from sim.cloth.pins import Pins
 from sim.cloth.sheet import build_sheet
@@ -292,6 +293,7 @@ class ClothSolver:
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
         self._integrator.take_parameters()
+        self._integrator.usual_dt = self._frame_dt / substeps_of(cloths)
         self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
         self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
         self._refines = np.array([cloth.substeps is None for cloth in cloths])
@@ -352,10 +354,14 @@ class ClothSolver:
         return slice(int(first), int(last))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """Where nodes are and how they move; the time, how many sweeps steps take, how they are divided and why."""
+        """Where nodes are and how they and shears move; the time, how many sweeps steps take, how they are divided and
+        why, and how long the last one was.
+        """
         state = self.state
         arrays = {name: getattr(state, name).to_numpy() for name in _STATE}
-        return {**arrays, "clock": np.array([self._time_s, self._sweeps, self._refinement, self._excess])}
+        arrays |= {f"shear_{k}": cells.on_device.followed.to_numpy() for k, cells in enumerate(self._cells)}
+        clock = self._time_s, self._sweeps, self._refinement, self._excess, self._integrator.last_dt
+        return {**arrays, "clock": np.array(clock)}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -363,15 +369,18 @@ class ClothSolver:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (4,)}
+        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (5,)}
+        expected |= {f"shear_{k}": (cells.count, 2) for k, cells in enumerate(self._cells)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f"checkpoint of the cloth: {name} must have shape {shape}, got {found}")
         for name, kind in _STATE.items():
             getattr(self.state, name).from_numpy(np.ascontiguousarray(arrays[name], dtype=kind))
+        for k, cells in enumerate(self._cells):
+            cells.on_device.followed.from_numpy(np.ascontiguousarray(arrays[f"shear_{k}"], dtype=np.float32))
         self.state.place_displaced()
-        self._time_s, sweeps, refinement, self._excess = arrays["clock"].tolist()
+        self._time_s, sweeps, refinement, self._excess, self._integrator.last_dt = arrays["clock"].tolist()
         self._sweeps, self._refinement = int(sweeps), int(refinement)
         self._hold_pins()
 

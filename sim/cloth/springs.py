@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.sheet import Grid, RestSheet, triangle_areas
+from sim.cloth.sheet import Grid, RestSheet, edges_of, triangle_areas
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
@@ -279,26 +279,6 @@ def _mesh_bends(sheet: RestSheet) -> Springs:
 
 FLAT = 1.0e-5
 """Two triangles that rise from their plane by less, in lengths of their common edge, are flat: files hold float32."""
-
-
-@dataclass(frozen=True, eq=False)
-class Edges:
-    """Edges of triangles.
-
-    Attributes:
-        nodes: their ends, the smaller number first, sorted, (e, 2) int32.
-        of_side: edge of each side of each triangle, (3 k,); side s of triangle t, from corner s on, is 3 t + s.
-    """
-
-    nodes: Indices
-    of_side: NDArray[np.int64]
-
-
-def edges_of(triangles: Indices) -> Edges:
-    """Each edge once."""
-    sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    nodes, of_side = np.unique(sides, axis=0, return_inverse=True)
-    return Edges(nodes.astype(np.int32), of_side.reshape(-1))
 
 
 def joined(
