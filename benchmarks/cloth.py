@@ -205,7 +205,7 @@ def described(
     positions: NDArray[np.float64], triangles: NDArray[np.integer], *, has_ball: bool = True
 ) -> dict[str, Any]:
     """Where a cloth lies [m], and whether it crosses itself."""
-    from sim.cloth.springs import edges_of
+    from sim.cloth.sheet import edges_of
     from sim.cloth.start import first_crossing
 
     ball = np.linalg.norm(positions - (0.0, 0.0, BALL_HEIGHT), axis=1) - BALL_RADIUS

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.cloth.cells import OWN_SHARE, TRIANGLE, Cells
-from sim.cloth.springs import BEND
+from sim.cloth.springs import BEND, OWN_SHARE, TRIANGLE, Cells
 
 if TYPE_CHECKING:
     from sim.cloth.device_springs import DeviceSprings

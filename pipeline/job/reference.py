@@ -13,7 +13,7 @@ from typing import Any
 
 from pipeline.job import schema
 from pipeline.model.problems import quoted_list
-from sim.cloth.materials import MATERIAL_UNITS, MATERIALS, SOURCES
+from sim.cloth.parameters import MATERIAL_UNITS, MATERIALS, SOURCES
 
 BEGIN = "<!-- reference: begin; written by `python -m pipeline.job.reference docs/guide/job-file.md` -->"
 END = "<!-- reference: end -->"

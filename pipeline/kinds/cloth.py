@@ -23,8 +23,7 @@ from render.cloth import vertex_normals
 from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject, SceneObject
-from sim.cloth.materials import Material
-from sim.cloth.parameters import ClothParameters, RectangleSheet
+from sim.cloth.parameters import ClothParameters, Material, RectangleSheet
 from sim.core.snapshots import Snapshot
 
 if TYPE_CHECKING:

@@ -151,12 +151,10 @@ def predict_in_air(
         F = rho A / 2 (C_n |v_n| v_n + C_t |v_t| v_t),   v_n + v_t = air - cloth
 
     with the cloth's velocity at the end of the step, as far as gravity and the air change it: stable for light cloth in
-    strong wind, and exact at terminal speed. `drag` is (rho C_n / 2, rho C_t / 2, mass of the triangle [kg]), which
-    keeps its mass where it is stretched; it yields by the share of its nodes that are not pinned.
+    strong wind, and exact at terminal speed. A triangle yields by the share of its nodes that are not pinned.
 
-    The air's velocity is what a coupling last found. What the cloth took from it since bounds the force: a part of it
-    with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
-    not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
+    The air's velocity is what a coupling last found. What the cloth took from it since bounds the force, so that air
+    within reach is not pushed beyond the cloth's velocity, and both together do not gain energy.
     """
     count = position.shape[0]
     for t in range(triangle_count):

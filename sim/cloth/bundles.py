@@ -90,6 +90,7 @@ class CellArrays(NamedTuple):
     across: Floats  # c_a of d_v [1/m], (arity s,)
     law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
     multiplier: Floats  # of the shear, (s,); rectangles only
+    followed: Strains  # shear where the last step started [-], and its smoothed rate [1/s], (s,)
     mesh: MeshNodes  # those of triangles; none of rectangles
 
 
@@ -299,7 +300,7 @@ class PairPieces(NamedTuple):
 
 @bundle
 class EdgeBlocks(NamedTuple):
-    """Edges of patches in blocks; see `patches.blocks_of`."""
+    """Edges of patches in blocks; see `self_collision.blocks_of`."""
 
     first_block: Integers  # of each patch, (m + 1,)
     edges: Pairs
@@ -313,7 +314,7 @@ class EdgeBlocks(NamedTuple):
 
 @bundle
 class TriangleBlocks(NamedTuple):
-    """Triangles of patches in blocks; see `patches.blocks_of`."""
+    """Triangles of patches in blocks; see `self_collision.blocks_of`."""
 
     first_block: Integers  # of each patch, (m + 1,)
     triangles: Triples

@@ -2,30 +2,20 @@
 
 The displacements u are those nearest to the predicted ones, in the norm of the masses, for which every contact has
 n . w >= floor, w = sum_k c_k u_k; friction then takes tangential displacement away, within Coulomb's cone. With
-P_c the impulse of contact c times the step, M u changes by sum_c c_k P_c, so that both sides get the same.
+P_c the impulse of contact c times the step, M u changes by sum_c c_k P_c, so that both sides get the same. All contacts
+push at once, by the residual over D_c = sum_i |c_ic| S_i / m_i, S_i = sum_c |c_ic|, at least the matrix of the problem
+by Cauchy's inequality (mass splitting, Tonge et al. 2012, with weights), with momentum (Nesterov 1983). Sums over
+contacts are sums of integers: the same for any order of contacts and threads.
 
-All contacts push at once. That overshoots where vertices share contacts; by Cauchy's inequality
-|sum_c c_ic P_c|² <= S_i sum_c |c_ic| |P_c|², S_i = sum_c |c_ic|, the matrix of the problem is at most the diagonal
-D_c = sum_i |c_ic| S_i / m_i, and steps of the residual over D_c converge (mass splitting, Tonge et al. 2012, with
-weights). Where all contacts push alike, as between two layers, D_c is exact and one step does; momentum (Nesterov 1983,
-of contacts Mazhar et al. 2015) brings the others.
-
-Sums over contacts are sums of integers, in units far below anything that matters: the same for any order of contacts
-and threads.
-
-A node under a heavy body on a floor passes on what neither its mass nor twenty steps could: D_c of it is ten thousand
-times too large for the body, which would fall through. So nodes between what stands and a body that moves, or between
-one of them and a node that the other touches, as in two layers, have a `support` e: they answer to contacts by
-(1 - e²)/m, about as heavily as the body. What the answer keeps from them is the floor's, so that the momentum of cloth
-and bodies changes by what stands alone. Nodes that are pressed from both sides do not leave or enter either whatever
-their mass. But the cloth's own springs pull them from under the body more easily than its friction would let them.
+A node under a heavy body on a floor passes on what neither its mass nor twenty steps could. So nodes between what
+stands and a body that moves, or between one of them and a node that the other touches, as in two layers, have a
+`support` e: they answer to contacts by (1 - e²)/m, about as heavily as the body; the rest is the floor's.
 """
 
 import taichi as ti
 
 from sim.cloth.bundles import Contacts, Impulses, PushedBodies, PushedNodes, Response
-from sim.cloth.proximity import unit_or
-from sim.cloth.proximity_contacts import INACTIVE, WALL
+from sim.cloth.contacts import INACTIVE, WALL, unit_or
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import large_kernel
@@ -201,9 +191,8 @@ def support_between(i: ti.i32, held_sums: Integers, lighter: ti.f32) -> ti.math.
 def turned_to_support(c: ti.i32, contacts: Contacts, support: Vectors) -> ti.math.vec3:
     """Normal of a contact of vertices that have a support: along that, as far as friction holds the wedge.
 
-    Where a ball rests on cloth on a floor, their forces are opposite, along the normal of the floor, and friction is
-    what turns that of the ball. To find it by iteration takes too many steps: what is left drives cloth out of the
-    wedge.
+    Where a ball rests on cloth on a floor, their forces are opposite, along the normal of the floor, as friction turns
+    that of the ball: to find it by iteration takes too many steps.
     """
     n = contacts.normal[c]
     axis, is_supported = ti.math.vec3(0.0), True
@@ -240,18 +229,11 @@ def weigh_contacts(r: Response, vertex_count: ti.i32, is_first: ti.i32):
     """List the contacts that push, and compute their diagonal D; before the first round of what was found, forget their
     impulses, and keep what displacements were `predicted` as it was looked for.
 
-    `counter` gets how many there are, and how many vertices they push, which are listed too. Contacts whose free
-    vertices weigh less than `LEAST_FREE_WEIGHT` do not push.
-
-    Which of them push a vertex, by their places in `pushing`, and with what weights, is listed in `used_by` and
-    `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
-    without the twelve atomic sums that each contact would otherwise take.
-
-    What stands and touches a vertex that nothing else touches is settled in one step (`settle_all`): its D is exact,
-    and no other contact hears of it. In draped cloth these are most of all that push.
-
-    If bodies may move, each vertex between what stands and a body that moves gets its `support`, and its contacts a
-    normal along that, from `held_sums`, `lever` and `pressing_body`.
+    `counter` gets how many there are, and how many vertices they push, which are listed too. Which of them push vertex
+    i, by their places in `pushing`, and with what weights, is listed in `used_by` and `use_weight`, between `uses[2 i]`
+    and `uses[2 i + 1]`, so that a step needs no atomic sums. What stands and touches a vertex that nothing else touches
+    is settled in one step (`settle_all`), as its D is exact. If bodies may move, each vertex between what stands and a
+    body that moves gets its `support`, and its contacts a normal along that.
     """
     contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
@@ -406,11 +388,9 @@ Momenta = ti.types.vector(STEPS + 1, ti.f32)
 def push_apart(momenta: Momenta, new_end: ti.i32, count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Response):
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
-    The first launch of an iteration notes where that is, of all of the `new_end` places that there are; bodies follow
-    the vertices up to `moved_end`.
-
     A step starts from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them. It leaves the
-    displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
+    displacements of the next, ahead by beta_{k+1} of those that it has `reached`. The first launch of an iteration
+    notes where that is, at `new_end` places; bodies follow the vertices up to `moved_end`.
     """
     impulses, nodes, bodies = ti.static((r.impulses, r.nodes, r.bodies))
     for place in range(new_end):
@@ -538,8 +518,7 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
 def finish_push(count: ti.i32, touched_count: ti.i32, moved_end: ti.i32, r: Response):
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
-    Nothing where there are no places, as it does not finish yet: a kernel with it and one without would be compiled,
-    for seconds each.
+    Nothing where there are no places, as it does not finish yet: one kernel, not two to be compiled.
     """
     contacts, impulses, nodes, bodies = ti.static((r.contacts, r.impulses, r.nodes, r.bodies))
     for place in range(count):

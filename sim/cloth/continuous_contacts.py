@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import connected_components
 
 from sim.cloth.bundles import PushedNodes, Response
 from sim.cloth.contact_response import STEPS, push, weigh_contacts
+from sim.cloth.contacts import ContactList
 from sim.cloth.parameters import MOST_TURNS
-from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import Box, SelfCollision, box_of
 from sim.cloth.state import ClothState
@@ -26,8 +26,7 @@ from sim.core.host_access import copied, take
 from sim.core.reductions import LaneReduction, runs_on_gpu
 
 if TYPE_CHECKING:
-    from sim.cloth.explicit import ExplicitSprings
-    from sim.cloth.xpbd import XPBDSprings
+    from sim.cloth.integrators import ExplicitSprings, XPBDSprings
 
 RELAXED_BEYOND = 0.03  # excess of a spring [rest lengths] beyond which springs and contacts take another turn
 
@@ -45,9 +44,8 @@ LARGEST_MOTION = 0.5
 that are farther apart may come half of the way."""
 
 JAMMED_SHARE = 0.1
-"""A cloth is jammed in a frame where impact zones move so much of its nodes as one, on average over the substeps. Falls
-and folds have some for a few substeps; cloth that wind presses into a heap has most of its nodes there in all of them,
-and no substep gets by without every round of repairs."""
+"""A cloth is jammed in a frame where impact zones move so much of its nodes as one, on average over the substeps: falls
+and folds have some for a few; cloth that wind presses into a heap has most of its nodes there in all."""
 
 IMPULSE_UNIT = 1.0e-5
 """Unit of impulses over the step, in mean masses of a vertex times m/s²: a millionth of the weight, however short the
@@ -60,10 +58,7 @@ class ContinuousContacts:
     A substep: the pairs of elements that may meet, and what may meet bodies and walls; displacements that keep all of
     them apart by their thickness, with friction; a test that no pair may have crossed on the way. Where it fails, the
     pairs' vertices are pushed, and at last moved as one (`ImpactZones`). So cloth that starts without crossing has
-    none at the end of any substep, whatever its speed; pins that are led through each other are the exception.
-
-    Linear momentum is kept to rounding. Angular momentum is kept by what pushes along the line between the points that
-    touch; friction between layers acts on two points a thickness apart, and spins by that arm.
+    none at the end of any substep; pins that are led through each other are the exception.
 
     Attributes:
         rigid: contacts with bodies and walls.
@@ -359,9 +354,8 @@ class SpringTurns:
 class ImpactZones:
     """Groups of vertices that get their mean displacement (Provot 1997; without rotation).
 
-    Nothing in a zone can cross, as a common translation leaves all distances as they are; and as a zone grows whenever
-    one of its vertices takes part in another crossing, the rounds end. Linear momentum is kept, angular momentum but
-    for the spin of the zone. Pinned vertices keep their displacement, and a zone that holds some follows their mean.
+    Nothing in a zone can cross, and as a zone grows whenever one of its vertices takes part in another crossing, the
+    rounds end. Pinned vertices keep their displacement, and a zone that holds some follows their mean.
 
     Args:
         mass: of all vertices [kg], (n,).

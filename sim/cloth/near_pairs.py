@@ -3,15 +3,30 @@
 import taichi as ti
 
 from sim.cloth.bundles import Four, PairPieces, PairSearch, PatchBlocks
-from sim.cloth.patches import BLOCK, FAR, NONE
-from sim.cloth.proximity import closest_on_edges, closest_on_triangle, distance_of_edges, distance_to_triangle, unit_or
-from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, append_contact, least_displacement
+from sim.cloth.contacts import (
+    EDGE_EDGE,
+    INACTIVE,
+    VERTEX_TRIANGLE,
+    append_contact,
+    closest_on_edges,
+    closest_on_triangle,
+    distance_of_edges,
+    distance_to_triangle,
+    least_displacement,
+    unit_or,
+)
 from sim.core.arrays import Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
 from sim.core.reductions import Results, Share, reduced_tree, runs_on_gpu
 from sim.core.scheduling import NO_MORE, begin_sharing, next_item
 from sim.core.warps import WARP, raise_to, whole_warps
+
+BLOCK = 16
+"""Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""
+
+FAR = 1.0e9  # coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32
+NONE = -1  # in the place of a vertex: the block has no element there
 
 OF_REST_DISTANCE = 0.7
 """Elements that are nearer than their thickness when the cloth is flat keep this part of their distance there."""
@@ -26,8 +41,7 @@ END_OF_EDGE = 1.0e-3
 
 LANES, LANES_OF_PIECE, EDGE_PARTS, VERTEX_PARTS = 32, 8, 2, 4
 """Threads of a GPU for a pair of patches, one for each edge or so, and those that look at a piece; how many times as
-many search for one, as one for each block that an edge is compared with; and how many of these share a vertex, of which
-a patch has a third as many as edges: each has a part of the block of triangles that it is compared with."""
+many search for one; and how many of these share a vertex, each with a part of a block of triangles."""
 
 
 def on_gpu(threads: int) -> int:
@@ -48,8 +62,8 @@ NEVER = -1.0e30
 """When a place is due in which no pair is listed."""
 
 SAFETY_OF_DUE = 1.0e-3
-"""Part of the thickness by which pairs are listed, and looked at, earlier than they could have come near: a thousand
-times what sums of float32 lose, so that what is found does not depend on when lists were made."""
+"""Part of the thickness by which pairs are listed, and looked at, earlier than they could have come near: far more than
+sums of float32 lose."""
 
 
 @ti.func
@@ -112,7 +126,7 @@ def pair_edges(p: ti.i32, thread: ti.i32, lanes: ti.i32, parts: ti.i32, search: 
     """List the edges of two patches that are near each other and share no vertex, as one of several threads.
 
     Edges are first told apart by their shadows on the line through their midpoints, and on what of that is across the
-    first of them: disjoint for most neighbours in flat cloth, where spheres around them are not.
+    first of them.
     """
     met, boxes, blocks, found = ti.static((search.met, search.boxes, search.blocks.edges, search.listed))
     soonest, lane, part = NEVER, thread % lanes, thread // lanes
@@ -355,14 +369,12 @@ def find_near_pairs(numbers: ti.math.ivec3, search: PairSearch):
     triangles of the other within `reach` [m] of them, and the edges of both within that of each other. Then append the
     listed pairs that are nearer than they shall be, or get there, and those that might cross.
 
-    Pieces that are too short for what is found move to the end of the list, and are searched again. If that is too
-    short, nothing else is done: once it is longer, a call that searches no pairs goes on from there.
+    Pieces that are too short for what is found move to the end of the list, and are searched again; where that is too
+    short, by a call that searches no pairs, once it is longer.
 
-    Of contacts, the displacement along the line of shortest distance counts. A pair might cross when its vertices,
-    displaced as they are now and by contacts besides, come together: then it is watched, `INACTIVE`. They come no
-    nearer than by twice their motion against their mean, nor than by the `approach` [m] of their patches; contacts are
-    `allowed` so much more [m]. Pairs that have been farther off than their patches have approached since are not even
-    looked at.
+    A pair might cross, and is watched, `INACTIVE`, when its vertices, displaced as they are now and by what contacts
+    are `allowed` besides, come together: no nearer than by twice their motion against their mean, nor than by the
+    `approach` of their patches.
 
     Args:
         numbers: whether to search, not if that is done, and only room was missing; most pairs of elements; workers

@@ -15,8 +15,8 @@ from sim.cloth.bundles import (
     TestedContacts,
 )
 from sim.cloth.contact_response import thickness_between
+from sim.cloth.contacts import EDGE_EDGE
 from sim.cloth.near_pairs import NEVER, SAFETY_OF_DUE
-from sim.cloth.proximity_contacts import EDGE_EDGE
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import func
 from sim.core.launch import kernel, large_kernel
@@ -28,9 +28,8 @@ FAR = 1.0e30
 SAFETY = 1.0e-5
 """Part of the motion of two patches against each other that is added to it: norms and sums of float32 lose some 1e-7.
 
-Residuals of the fit lose some 2e-7 of the whole displacement besides, nanometres in a substep. That needs no term: what
-is not listed is still a whole thickness apart when a list runs out, so that contacts begin later by that, and nothing
-has met unseen. What positions do besides their displacements, as they are rounded, is measured.
+Residuals of the fit lose as much of the whole displacement besides, nanometres in a substep: what is not listed is
+still a whole thickness apart when a list runs out. What positions do as they are rounded is measured.
 """
 
 REGULARIZATION = 1.0e-5
@@ -70,9 +69,8 @@ def look_at_patches(
     """Where patches are, and how they move in this substep; then, if the list of their pairs holds, which of these have
     to be searched, and of which some elements are due.
 
-    A rigid motion c + w x (x - centre) is fitted to the displacements of each patch, by least squares. The fit decides
-    how small the rest is, not whether it is a bound. The list holds while what patches spend, with the motion of this
-    substep and what may come besides, is within their reach.
+    A rigid motion c + w x (x - centre) is fitted to the displacements of each patch, by least squares. The list holds
+    while what patches spend, with this motion and what may come besides, is within their reach.
 
     Args:
         vertex_count, of_vertices: the vertices, and how lanes share them; 0 if patches have been looked at, and how far
@@ -176,9 +174,8 @@ def fit_motion(m: ti.i32, still: ti.f32, followed: Followed):
 def place_leaves(patches: MovingPatches, edge: ti.f32, thickness: ti.f32, tree: BoxTree):
     """Leaves of a complete binary tree: boxes around the patches, then empty ones; leaf k is node `leaves` + k.
 
-    Boxes are larger than the patches by half a thickness and by as much as these may move, their `reach`: in
-    `FEWEST_SUBSTEPS` to `MOST_SUBSTEPS` like this one, as many as take them `PATCH_REACH_IN_EDGES`, and by half an edge
-    [m] besides.
+    Boxes are larger than the patches by half a thickness and by their `reach`: as much as they may move in
+    `FEWEST_SUBSTEPS` to `MOST_SUBSTEPS` like this one, and half an edge [m].
     """
     for leaf in range(tree.leaves):
         lowest, highest = ti.math.vec3(FAR), ti.math.vec3(-FAR)
@@ -196,7 +193,7 @@ def place_leaves(patches: MovingPatches, edge: ti.f32, thickness: ti.f32, tree: 
 def merge_boxes(first: ti.i32, tree: BoxTree):
     """Boxes of a level, of the nodes `first` to 2 `first` - 1: 2 k and 2 k + 1 are below k, and 1 is the root.
 
-    On a CPU serial: half a million nodes of cloth have 65,000 patches, whose level takes 0.2 ms now and then.
+    On a CPU serial: they are few.
     """
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
@@ -284,8 +281,7 @@ def approach_of(m: ti.i32, other: ti.i32, motion: PatchMotion) -> ti.f32:
     """How much nearer points of two patches come at most [m].
 
     With any w and c, points P and Q go to P + c + w x P + d and Q + c + w x Q + d'. P - Q + w x (P - Q) is never
-    shorter than P - Q, so that distances shrink by |d| + |d'| at most. With the mean of their turns as w that is least
-    where neighbours bend about what they share: their middles then move as w says, and both turn against it by half.
+    shorter than P - Q, so that distances shrink by |d| + |d'| at most; w is the mean of their turns.
     """
     turn, nearer = 0.5 * (motion.turn[m] + motion.turn[other]), motion.rest[m] + motion.rest[other]
     if m != other:
@@ -345,7 +341,7 @@ def measure_change(m: ti.i32, followed: Followed, predicted: Vectors):
     """How far contacts displaced the vertices of a patch at most, `change` [m]; where that is beyond the `margin` that
     was allowed for, half as much again is from now on.
 
-    The second number that is counted becomes 1 where it is beyond, and the third where it is not finite.
+    The second number that is counted becomes 1 where it is, the third where the change is not finite.
     """
     patches, counter = ti.static((followed.patches, followed.met.found))
     (corners,) = ti.static((patches.corners,))
@@ -398,10 +394,9 @@ ROUNDING = 1.0e-6
 def repair_crossing(c: ti.i32, contacts: Contacts, tested: TestedContacts, followed: Followed):
     """Count a pair if it is not certainly apart all through the substep, and have its worst vertices pushed.
 
-    Two sides that a plane across n separates at the start, and one across n at the end, are separated all the time in
-    between: n . (x_a - x_b) of any two vertices is linear in time. So it is enough that the separation along n, that
-    of the nearest two vertices, keeps 1 - `LARGEST_SHARE` of what it was; or all of it where it was none.
-    `crossing` gets 1 for pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
+    It is if the separation along its normal n, that of the nearest two vertices, keeps 1 - `LARGEST_SHARE` of what it
+    was, or all of it where it was none: n . (x_a - x_b) of any two vertices is linear in time. `crossing` gets 1 for
+    pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
     """
     tested.crossing[c] = 0
     mobile = 0.0
@@ -462,10 +457,9 @@ def end_contacts(
 
     Args:
         count, contacts, tested: see `repair_crossing`.
-        vertex_count: number of vertices.
-        predicted: displacements as contacts were looked for [m].
+        vertex_count, predicted: vertices, and their displacements as contacts were looked for [m].
         is_changed: whether contacts displaced anything.
-        followed: the patches and their pairs; `found` gets three numbers.
+        followed: the patches and their pairs; `found` gets what is returned.
         workers: see `sim.core.scheduling`; for patches that contacts may have displaced, all, and their pairs.
 
     Returns how many pairs failed; whether patches were displaced farther than allowed for; and whether any displacement

@@ -20,11 +20,9 @@ from sim.cloth.bundles import (
     Walls,
     Weights,
 )
+from sim.cloth.contacts import WALL, ContactList, append_contact, closest_on_triangle, least_displacement, unit_or
 from sim.cloth.near_pairs import LANES, on_gpu
-from sim.cloth.patches import Patches
-from sim.cloth.proximity import closest_on_triangle, unit_or
-from sim.cloth.proximity_contacts import WALL, ContactList, append_contact, least_displacement
-from sim.cloth.self_collision import Box
+from sim.cloth.self_collision import Box, Patches
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func, with_room
@@ -106,10 +104,8 @@ class RigidContact(DeviceShapes):
     """Finds where cloth touches bodies and walls: bodies that move, then those that stand still.
 
     Cloth stays half its thickness away from both. Its vertices are looked at, which keep a little more where a round
-    body would show a little between them (`CollidingBodies.lift`); and where it may show more, as it is sharp, small or
-    thinly covered, the deepest point of each triangle.
-    The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
-    by less than `LARGEST_ADVANCE` (`stable_dt`).
+    body would show a little between them (`CollidingBodies.lift`); and where it may show more, the deepest point of
+    each triangle. Nothing tunnels while bodies and cloth move by less than `LARGEST_ADVANCE` (`stable_dt`).
 
     Attributes:
         colliding: the bodies for kernels that find contacts.
@@ -265,9 +261,8 @@ class RigidContact(DeviceShapes):
 
         Args:
             state: at the start of a step.
-            nodes: numbers of those that are looked at.
-            box: middle and half edges of the box around their velocities [m/s], (3,) each; nodes are looked at one by
-                one where all of them as fast as any and near the bodies would need shorter steps.
+            nodes: numbers of those that are looked at, one by one only if needed.
+            box: middle and half edges of the box around their velocities [m/s], (3,) each.
             at_most: the largest step otherwise [s].
         """
         if not self.count:
@@ -421,9 +416,8 @@ def touch_body(
     """Append a body if a point of the cloth, the weighted mean of vertices, comes nearer to it than it keeps, or would
     with what is `allowed` besides [m].
 
-    Of its gradient there only what is `across` the element counts in which this point is the nearest to the body: on
-    an edge of the body gradients are those of its faces, which would push the element along itself. How deep it is gets
-    noted in thicknesses, if `half` of that is not 0.
+    Of its gradient only what is `across` the element counts in which this point is the nearest to the body. How deep it
+    is gets noted in thicknesses, if `half` of that is not 0.
     """
     surface, bodies = ti.static((near.surface, near.bodies))
     x, u = ti.math.vec3(0.0), ti.math.vec3(0.0)
@@ -467,8 +461,7 @@ def touch_body(
 def deepest_on_triangle(y: Corners, in_middle: ti.f32, b: ti.i32, shapes: Shapes) -> ti.math.vec3:
     """Barycentric coordinates of the point of a triangle, in the frame of a shape, that is deepest in it or nearest.
 
-    Of balls exact. Else the best of six points around the best so far, ever nearer, from the middle on: distances to
-    convex bodies have no minimum but one.
+    Of balls exact; else the best of six points around the best so far, ever nearer, from the middle on.
     """
     best, least, step = ti.math.vec3(1.0 / 3.0), in_middle, 1.0 / 3.0
     if shapes.kind[b] == SPHERE:
@@ -504,9 +497,8 @@ def find_rigid_contacts(
     """Append the contacts of vertices with walls, which are flat, so that vertices are enough; if cloth `meets` bodies,
     also with these, and if some show between vertices, those of triangles, each at its deepest point.
 
-    Parallel however few there are: compiled twice, normals would be rounded differently. `work` has the threads that
-    share a patch, and workers (`sim.core.scheduling`). Returns the first two numbers of the list's counter, of which
-    one is 0 then.
+    `work` has the threads that share a patch, and workers (`sim.core.scheduling`). Returns the first two numbers of the
+    list's counter, of which one is 0 then.
     """
     vertices, surface, contacts = ti.static((patches.vertices, near.surface, near.contacts))
     walls, bodies = ti.static((near.walls, near.bodies))
@@ -564,8 +556,8 @@ def touch_triangle(b: ti.i32, corners: Three, allowed: ti.f32, near: Touching):
     `touch_body`.
 
     What is nearest at an edge is left to that where edges are looked at, too. A triangle with a corner that a pin holds
-    in the body is where the job wants it. The distance to a convex body is a convex function: it sags nowhere below
-    that between the corners by more than three times what it does in their middle.
+    in the body is where the job wants it. The distance to a convex body sags nowhere by more than three times what it
+    does in the middle of a triangle.
     """
     surface, bodies = ti.static((near.surface, near.bodies))
     v, third = corners, 1.0 / 3.0

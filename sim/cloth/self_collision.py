@@ -1,11 +1,11 @@
-"""Cloth against cloth: which elements may meet, kept in lists that are searched anew where and when motion has used
-them up.
+"""Cloth against cloth: which elements may meet, patch by patch, kept in lists that are searched anew where and when
+motion has used them up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from itertools import pairwise
 
 import numpy as np
 import taichi as ti
@@ -14,18 +14,24 @@ from numpy.typing import NDArray
 from sim.cloth.bundles import (
     Boxes,
     BoxTree,
+    EdgeBlocks,
     Followed,
     Four,
     KnownPairs,
     MovingPatches,
     PairPieces,
     PairSearch,
+    PatchBlocks,
+    PatchLists,
     PatchMotion,
+    PatchNodes,
     PatchPairArrays,
     TestedContacts,
+    TriangleBlocks,
     Two,
 )
-from sim.cloth.near_pairs import NEVER, carry_pieces, find_near_pairs, keep_pairs, range_of_vectors
+from sim.cloth.contacts import GROWTH, ContactList
+from sim.cloth.near_pairs import BLOCK, NEVER, NONE, carry_pieces, find_near_pairs, keep_pairs, range_of_vectors
 from sim.cloth.patch_motion_kernels import (
     LARGEST_STILL,
     end_contacts,
@@ -35,16 +41,111 @@ from sim.cloth.patch_motion_kernels import (
     place_leaves,
     sort_known,
 )
-from sim.cloth.patches import Patches, blocks_of
-from sim.cloth.proximity_contacts import GROWTH, ContactList
+from sim.cloth.state import ClothState, HostCloths
 from sim.core.arrays import on_device
 from sim.core.bundles import with_room
 from sim.core.host_access import copied
-from sim.core.reductions import LaneReduction
+from sim.core.reductions import LaneReduction, runs_on_gpu
 from sim.core.scheduling import workers_for
 
-if TYPE_CHECKING:
-    from sim.cloth.state import ClothState
+TRIANGLES_PER_PATCH, ON_GPU = 32, 24
+"""Most triangles of a patch: few enough for all of them to move nearly as one, and enough for one pair of patches to
+stand for hundreds of pairs of elements; on a GPU fewer, as the threads of a pair work longer than those of others."""
+
+
+class Patches:
+    """Splits cloths into compact patches, by halving each along its longest extent until it is small.
+
+    Every triangle, edge and vertex belongs to one of the m patches. A binary tree over their numbers is a hierarchy of
+    boxes, as they are in the order of the halvings.
+
+    Attributes:
+        count: number of patches, m.
+        vertex_count: of all patches, n.
+        leaves: m rounded up to a power of two.
+        lists: elements in the order of the patches.
+        corners: all vertices of each patch's triangles, which its edges end at, its own and others.
+        cloth: of each patch, (m,).
+
+    Args:
+        host: the cloths where they start; every vertex is one of a triangle.
+    """
+
+    def __init__(self, host: HostCloths) -> None:
+        triangles, edges = host.triangles, host.edges.nodes
+        patch = _patch_of_triangles(host)
+        self.count = int(patch.max()) + 1 if len(patch) else 0
+        self.vertex_count = len(host.position)
+        self.leaves = 1 << max(self.count - 1, 0).bit_length()
+        order, first_triangle = np.argsort(patch, kind="stable"), _starts(patch, self.count)
+        corner_patch, corner = np.unique(np.stack([np.repeat(patch, 3), triangles.ravel()]), axis=1)
+        self.corners = PatchNodes(self.count, on_device(_starts(corner_patch, self.count)), on_device(corner))
+        # The first patch that a vertex is a corner of owns it, and so an edge: the first with both of its ends in a
+        # triangle, as edges are sides of triangles.
+        owner = np.full(len(host.position), self.count)
+        np.minimum.at(owner, corner, corner_patch)
+        own = on_device(_starts(np.sort(owner), self.count)), on_device(np.argsort(owner, kind="stable"))
+        edge_owner = np.full(len(edges), self.count)
+        np.minimum.at(edge_owner, host.edges.of_side, np.repeat(patch, 3))
+        first_edge, in_order = _starts(np.sort(edge_owner), self.count), np.argsort(edge_owner, kind="stable")
+        elements = first_edge, edges[in_order], first_triangle, triangles[order]
+        self.lists = PatchLists(PatchNodes(self.count, *own), *map(on_device, elements))
+        self.cloth = on_device(host.body[triangles[order[first_triangle[:-1]], 0]])
+
+
+def _patch_of_triangles(host: HostCloths) -> NDArray[np.int64]:
+    """Number of the patch of each triangle, (k,)."""
+    patch = np.zeros(len(host.triangles), dtype=np.int64)
+    centre = host.position[host.triangles].mean(axis=1)
+    most, count = ON_GPU if runs_on_gpu() else TRIANGLES_PER_PATCH, 0
+    for first, last in zip(host.first_triangle[:-1], host.first_triangle[1:], strict=True):
+        halvings = max(int(np.ceil(np.log2(max(last - first, 1) / most))), 0)
+        order = np.arange(first, last)
+        for level in range(halvings):
+            # All parts of a level at once: each is sorted along its own longest extent, and cut in its middle.
+            bounds = (last - first) * np.arange(2**level + 1) // 2**level
+            part = np.repeat(np.arange(2**level), np.diff(bounds))
+            inner = bounds[:-1]
+            extent = np.maximum.reduceat(centre[order], inner) - np.minimum.reduceat(centre[order], inner)
+            along = centre[order, extent.argmax(axis=1)[part]]
+            order = order[np.lexsort((along, part))]
+        bounds = (last - first) * np.arange(2**halvings + 1) // 2**halvings
+        patch[order] = count + np.repeat(np.arange(2**halvings), np.diff(bounds))
+        count += 2**halvings
+    return patch
+
+
+def _starts(patch: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Where each of the patches begins among values in their order; and the number of all, (count + 1,)."""
+    starts: NDArray[np.int64] = np.concatenate([[0], np.cumsum(np.bincount(patch, minlength=count))])
+    return starts
+
+
+def blocks_of(patches: Patches) -> PatchBlocks:
+    """Edges and triangles of each patch in whole blocks, which are filled up with elements that are far from all.
+
+    One array for each component, and blocks of a length that the compiler knows: so it compares eight elements in an
+    instruction. `NONE` is in places that only fill up.
+    """
+    lists, count = patches.lists, patches.count
+    triangles = TriangleBlocks(*_blocks(lists.triangles, lists.first_triangle, count))
+    return PatchBlocks(lists.vertices, triangles, EdgeBlocks(*_blocks(lists.edges, lists.first_edge, count)))
+
+
+def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:
+    """First block of each patch, the elements in their places, and room for six components."""
+    numbers, starts = elements.to_numpy(), first.to_numpy()[: count + 1].astype(np.int64)
+    blocks: NDArray[np.int64] = np.concatenate([[0], np.cumsum(-(-np.diff(starts) // BLOCK))]).astype(np.int64)
+    places = max(int(blocks[-1]), 1) * BLOCK
+    padded = np.full((places, numbers.shape[1]), NONE, dtype=np.int32)
+    for block, (start, end) in zip(blocks, pairwise(starts), strict=False):
+        padded[block * BLOCK : block * BLOCK + end - start] = numbers[start:end]
+    return (
+        on_device(np.resize(blocks, max(len(blocks), 2))),
+        on_device(padded),
+        *(ti.ndarray(ti.f32, places) for _ in range(6)),
+    )
+
 
 Array = NDArray[np.float64]
 Box = tuple[Array, Array]
@@ -145,14 +246,11 @@ def _places(capacity: int) -> dict[str, ti.Ndarray]:
 class SelfCollision:
     """Finds the pairs of cloth elements, of one cloth or several, that are near each other.
 
-    Every crossing of two triangles without a common corner, or with one, begins with a vertex that meets a triangle of
-    which it is no corner, or with two edges without a common vertex that meet; so these are all pairs. Patches of some
-    thirty triangles that may meet within some substeps are paired first; each pair of patches has a list of its
-    elements within thickness + skin, which holds until their motion, apart from rigid motion in common, has used the
-    skin up. What is found in the lists does not depend on when they were made.
-
-    Where nothing may meet, bodies still need boxes of patches and of their displacements; vertices are neither tested
-    nor followed.
+    These are vertices with triangles of which they are no corner, and edges without a common vertex: each crossing
+    begins with a pair of them. Patches that may meet within some substeps are paired first; each pair of patches has a
+    list of its elements within thickness + skin, which holds until their motion, apart from rigid motion in common, has
+    used the skin up. What is found does not depend on when lists were made. Where nothing may meet, bodies still need
+    boxes of patches.
 
     Attributes:
         patches: of the cloths.
@@ -336,8 +434,7 @@ class SelfCollision:
     def find(self, contacts: ContactList, recovery: float, *, is_ahead: bool = False) -> None:
         """Append the pairs that are too near, get there, or might cross; after `look`.
 
-        All pairs are listed first that vertices can bring within their thickness, or together, in this substep. Pairs
-        that are not listed come no nearer than a thickness without contacts, and do not meet where these displace
+        Pairs that are not listed come no nearer than a thickness without contacts, and do not meet where these displace
         vertices within their margins.
 
         Args:
@@ -377,7 +474,6 @@ class SelfCollision:
     ) -> Callable[[], list[int]]:
         """Test contacts, and if all is well the substep is over: its motion is used up, and what contacts added to it.
 
-        Where they displaced patches farther than allowed for, they may displace these half as far again from now on.
         Asks for what `end_contacts` returns.
 
         Args:

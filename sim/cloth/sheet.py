@@ -73,6 +73,26 @@ class RestSheet:
     warnings: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Edges of triangles.
+
+    Attributes:
+        nodes: their ends, the smaller number first, sorted, (e, 2) int32.
+        of_side: edge of each side of each triangle, (3 k,); side s of triangle t, from corner s on, is 3 t + s.
+    """
+
+    nodes: Indices
+    of_side: NDArray[np.int64]
+
+
+def edges_of(triangles: NDArray[np.integer]) -> Edges:
+    """Each edge once."""
+    sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    nodes, of_side = np.unique(sides, axis=0, return_inverse=True)
+    return Edges(nodes.astype(np.int32), of_side.reshape(-1))
+
+
 def build_sheet(shape: RectangleSheet | MeshShape) -> RestSheet:
     """The sheet that a job describes.
 
@@ -185,9 +205,8 @@ def warp_of(vertices: Vectors, triangles: NDArray[np.integer], axes: NDArray[np.
         triangles: (k, 3).
         axes: numbers of the two axes along which the sheet is longest.
     """
-    sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    ends, count = np.unique(sides, axis=0, return_counts=True)
-    border = ends[count == 1]
+    edges = edges_of(triangles)
+    border = edges.nodes[np.bincount(edges.of_side) == 1]
     x, y = (vertices[border[:, 1]] - vertices[border[:, 0]])[:, axes].T
     along, length = x + 1j * y, np.hypot(x, y)
     turned = (along**4 / np.maximum(length, SMALLEST_LENGTH * 1e-6) ** 3).sum()  # the same for all four directions
@@ -262,10 +281,8 @@ def _refuse_flat_triangles(vertices: Vectors, triangles: NDArray[np.int64], wher
 
 
 def _refuse_branching_edges(triangles: NDArray[np.int64], where: Where, label: str) -> None:
-    edges, count = np.unique(
-        np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
-    )
-    branching = edges[count > 2]
+    edges = edges_of(triangles)
+    branching = edges.nodes[np.bincount(edges.of_side) > 2]
     if len(branching):
         raise ShapeError(
             f'shape.file: {len(branching)} edges of "{label}" have three triangles or more, the first at '

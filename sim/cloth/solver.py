@@ -8,11 +8,9 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.air import ClothAir, push_nodes
-from sim.cloth.cells import cells_of
 from sim.cloth.continuous_contacts import ContinuousContacts, SpringTurns
-from sim.cloth.device_cells import DeviceCells
-from sim.cloth.device_springs import DeviceSprings
-from sim.cloth.explicit import ExplicitSprings
+from sim.cloth.device_springs import DeviceCells, DeviceSprings
+from sim.cloth.integrators import ExplicitSprings, XPBDSprings
 from sim.cloth.parameters import (
     DEFAULT_SUBSTEPS,
     MOST_REFINED,
@@ -20,14 +18,14 @@ from sim.cloth.parameters import (
     RUNAWAY_SPEED,
     ClothParameters,
     shared_conflicts,
+    substeps_of,
 )
 from sim.cloth.pins import Pins
 from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import ACCURATE_SHARE, joined, springs_of, too_few_substeps
+from sim.cloth.springs import ACCURATE_SHARE, cells_of, joined, springs_of, too_few_substeps
 from sim.cloth.start import reach_of, too_coarse_positions
 from sim.cloth.state import ClothState, HostCloths, Load, finish_step
 from sim.cloth.totals import ClothTotals
-from sim.cloth.xpbd import XPBDSprings
 from sim.core.domain import DomainParameters
 from sim.core.host_access import add, copied, viewed
 from sim.core.parameters import Vector3
@@ -54,8 +52,7 @@ class ClothSolver:
     """All cloths of a scene, as they share their substeps and collide with each other.
 
     One substep: pins move; gravity and air accelerate the nodes, and explicit springs; compliant springs, then contacts
-    correct where that leads; velocities and positions follow from where nodes end up. Every node has its share of the
-    sheet's mass (lumped), every triangle its share of the air.
+    correct where that leads; velocities and positions follow from where nodes end up.
 
     Attributes:
         state: of all nodes.
@@ -215,9 +212,8 @@ class ClothSolver:
     def stable_dt(self) -> float:
         """Largest step [s]: the share of a frame that was asked for, what springs bear, what contacts bear.
 
-        Of cloths for which no number of substeps is given, a fraction of that while their springs are longer than their
-        tension makes them by what contacts do: what these push out and springs pull back in does not settle in long
-        steps, and gains energy.
+        Of cloths for which no number of substeps is given, a fraction of that while contacts leave their springs longer
+        than their tension makes them.
         """
         dt = min(self._asked_dt, self._free_dt / self._refinement)
         return dt if self.contacts is None else self.contacts.stable_dt(dt)
@@ -244,8 +240,7 @@ class ClothSolver:
         """Springs and contacts in turns, and where they lead; as these leave springs too long, the next step has more
         sweeps, or is shorter.
 
-        One sweep, and no measure of springs by themselves, of a cloth that is given `substeps`: these are what it pays
-        for. Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
+        Sweeps adapt to cloths that omit both keys, turns are taken by those that omit `iterations`, and steps are
         shortened for those that omit `substeps`.
         """
         state, integrator = self.state, self._integrator
@@ -298,6 +293,7 @@ class ClothSolver:
         for family in (*self._springs, *self._cells):
             family.set_material(cloths)
         self._integrator.take_parameters()
+        self._integrator.usual_dt = self._frame_dt / substeps_of(cloths)
         self._iterations = np.array([cloth.iterations or 1 for cloth in cloths])
         self._takes_turns = np.array([cloth.iterations is None for cloth in cloths])
         self._refines = np.array([cloth.substeps is None for cloth in cloths])
@@ -358,10 +354,14 @@ class ClothSolver:
         return slice(int(first), int(last))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """Where nodes are and how they move; the time, how many sweeps steps take, how they are divided and why."""
+        """Where nodes are and how they and shears move; the time, how many sweeps steps take, how they are divided and
+        why, and how long the last one was.
+        """
         state = self.state
         arrays = {name: getattr(state, name).to_numpy() for name in _STATE}
-        return {**arrays, "clock": np.array([self._time_s, self._sweeps, self._refinement, self._excess])}
+        arrays |= {f"shear_{k}": cells.on_device.followed.to_numpy() for k, cells in enumerate(self._cells)}
+        clock = self._time_s, self._sweeps, self._refinement, self._excess, self._integrator.last_dt
+        return {**arrays, "clock": np.array(clock)}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -369,15 +369,18 @@ class ClothSolver:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (4,)}
+        expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (5,)}
+        expected |= {f"shear_{k}": (cells.count, 2) for k, cells in enumerate(self._cells)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f"checkpoint of the cloth: {name} must have shape {shape}, got {found}")
         for name, kind in _STATE.items():
             getattr(self.state, name).from_numpy(np.ascontiguousarray(arrays[name], dtype=kind))
+        for k, cells in enumerate(self._cells):
+            cells.on_device.followed.from_numpy(np.ascontiguousarray(arrays[f"shear_{k}"], dtype=np.float32))
         self.state.place_displaced()
-        self._time_s, sweeps, refinement, self._excess = arrays["clock"].tolist()
+        self._time_s, sweeps, refinement, self._excess, self._integrator.last_dt = arrays["clock"].tolist()
         self._sweeps, self._refinement = int(sweeps), int(refinement)
         self._hold_pins()
 

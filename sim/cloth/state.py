@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.bundles import Nodes, Surface
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.sheet import RestSheet, pieces_of
-from sim.cloth.springs import Edges, edges_of
+from sim.cloth.sheet import Edges, RestSheet, edges_of, pieces_of
 from sim.cloth.start import quantum_of, start_positions
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import with_room
@@ -34,7 +33,7 @@ class HostCloths:
         node_area: share of the area of each node [m²], (n,).
         uv: coordinates on the sheet at rest [m], (n, 2).
         triangles: (k, 3) int32.
-        edges: of the triangles (`springs.Edges`).
+        edges: of the triangles (`sheet.Edges`).
         body: cloth of each node, (n,) int32.
         is_connected: of each cloth, whether it is one piece.
     """
@@ -89,9 +88,8 @@ class ClothState:
     """Nodes, triangles and edges; n nodes, k triangles, e edges, b cloths.
 
     A substep starts at `lattice` times `quantum`, and `displacement` leads to where it ends; springs and contacts
-    change only that. What the lattice cannot hold of a displacement waits in `carry` and is part of the next one. So
-    neither velocities nor lengths of springs feel the rounding of positions, however short the step; float32 positions
-    of cloth a metre off the origin move in jumps of 0.1 um, 1 mm/s in a step of 0.1 ms.
+    change only that. What the lattice cannot hold of a displacement waits in `carry` and is part of the next one: so
+    neither velocities nor lengths of springs feel the rounding of positions.
 
     Attributes:
         host: what they started with, on the host.
@@ -221,11 +219,9 @@ def move_pinned(
 def finish_step(nodes: Nodes, position: Vectors, limit: ti.i32, dt: ti.f32, reasons: Integers):
     """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
 
-    A velocity changes by what the displacement differs from dt times itself: the same as the displacement over dt, but
-    for the rounding of 1/dt, which would make all velocities grow or shrink alike. Nodes stop at the ends of the
-    lattice. Where a displacement is not finite, the velocity shows it.
-
-    Nothing is done unless the three `reasons` why the substep may not be over are 0.
+    A velocity changes by what the displacement differs from dt times itself, as the rounding of 1/dt would make all
+    velocities grow or shrink alike. Nodes stop at the ends of the lattice. Where a displacement is not finite, the
+    velocity shows it. Nothing is done unless the three `reasons` why the substep may not be over are 0.
     """
     end = ti.select(reasons[0] + reasons[1] + reasons[2] == 0, position.shape[0], 0)
     for i in range(end):
@@ -272,8 +268,8 @@ class NodeLoad:
 
     def put_on(self, state: ClothState, gravity: Vector3, dt: float) -> None:
         """Let the nodes take their impulses and carry their loads; gravity [m/s²] is what they will feel in dt [s]."""
-        nodes = state.inverse_mass, self._own_inverse, state.carried, state.velocity
-        put_on_load(self.mass, self.impulse, ti.math.vec3(*gravity), dt, *nodes)
+        own = self._own_inverse, state.carried
+        put_on_load(self.mass, self.impulse, *own, ti.math.vec3(*gravity), dt, state.nodes)
 
     def take_off(self, state: ClothState) -> None:
         """Give the nodes their own masses back."""
@@ -282,23 +278,18 @@ class NodeLoad:
 
 @kernel
 def put_on_load(
-    mass: Floats,
-    impulse: Vectors,
-    gravity: ti.math.vec3,
-    dt: ti.f32,
-    inverse_mass: Floats,
-    own_inverse: Floats,
-    carried: Floats,
-    velocity: Vectors,
+    mass: Floats, impulse: Vectors, own: Floats, carried: Floats, gravity: ti.math.vec3, dt: ti.f32, nodes: Nodes
 ):
-    """v_n += J_n/(m_n + m_load), less what gravity would do to the load, with the mass of both from then on."""
-    for n in range(inverse_mass.shape[0]):
-        w_n = inverse_mass[n]
-        own_inverse[n] = w_n
+    """v_n += J_n/(m_n + m_load), less what gravity would do to the load, with the mass of both from then on; `own`
+    inverse masses are kept.
+    """
+    for n in range(mass.shape[0]):
+        w_n = nodes.inverse_mass[n]
+        own[n] = w_n
         if w_n > 0.0:
             with_load = w_n / (1.0 + mass[n] * w_n)
-            velocity[n] += with_load * (impulse[n] - dt * mass[n] * gravity)
-            inverse_mass[n] = with_load
+            nodes.velocity[n] += with_load * (impulse[n] - dt * mass[n] * gravity)
+            nodes.inverse_mass[n] = with_load
             carried[n] += mass[n]
 
 

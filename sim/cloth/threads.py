@@ -36,22 +36,16 @@ class ThreadSolver:
     """Block Gauss-Seidel: pieces of a thread of some springs each, colour by colour, every piece exactly.
 
     The multipliers of a piece follow from a tridiagonal system (Deul et al. 2018, "Direct position-based solver for
-    stiff rods", here without branches). A thread acts as a chain of pieces instead of one of springs, and stretches
-    less by the length of a piece.
+    stiff rods", here without branches), by parallel cyclic reduction in a block of a GPU's threads (Zhang, Cohen &
+    Owens 2010, "Fast tridiagonal solvers on the GPU"), a row each; on a CPU `LANES` pieces side by side, from end to
+    end and back (Thomas algorithm).
 
-    Directions are those of the start, as in SHAKE (Ryckaert, Ciccotti & Berendsen 1977): then a swinging sheet keeps
-    its energy, of which directions of the prediction take a part in every step. Springs that turn far in a step, as
-    where cloth buckles, push along the prediction, as nothing else leads to their length.
+    Directions are those of the start, as in SHAKE (Ryckaert, Ciccotti & Berendsen 1977), but for springs that turn far
+    in a step. Across the thread tension is an explicit force then, too strong where waves run along a spring within a
+    step: `straighten` lets a part of what is more turn with its springs.
 
-    With fixed directions tension pulls nodes back across the thread as an explicit force does: beyond
-    dt < |d| (m / 2 T |d|)^(1/2), the time in which a wave passes a spring, that overshoots, and a cloth that hangs from
-    its corner would jitter there. `straighten` therefore lets a part of what is more turn with its springs, as in
-    Newmark's implicit scheme.
-
-    A block of a GPU's threads solves a piece by parallel cyclic reduction (Hockney 1965; Zhang, Cohen & Owens 2010,
-    "Fast tridiagonal solvers on the GPU"), a row each; a thread of a CPU `LANES` pieces side by side, from end to end
-    and back (Thomas algorithm). Kernels here and in `xpbd` write x = x + y: what stands at an index from memory Taichi
-    would add to by an atomic operation for +=.
+    Kernels here and in `integrators` write x = x + y: what stands at an index from memory Taichi would add to by an
+    atomic operation for +=.
     """
 
     def __init__(self, springs: DeviceSprings) -> None:
@@ -146,7 +140,7 @@ def solve_forth(
 ):
     """Eliminate the rows of `LANES` pieces, or of those that are left of a colour, from their first springs on.
 
-    Loops over lanes that read and write local blocks alone become vector instructions. `tension` keeps lengths.
+    Loops over lanes that use local blocks alone become vector instructions. `tension` keeps lengths.
     """
     start, count, longest = ti.Vector.zero(ti.i32, LANES), ti.Vector.zero(ti.i32, LANES), 0
     u, x, n = ti.Matrix.zero(ti.f32, 3, LANES), ti.Matrix.zero(ti.i32, 3, LANES), ti.Matrix.zero(ti.f32, 3, LANES)
@@ -383,9 +377,8 @@ def measure_excess(
     """Largest excess of springs of threads, (|d| - rest + shift + l/(k dt²)) / rest, nothing between two nodes that
     are held; and how many have not converged. Two numbers are `found`.
 
-    Where a spring is solved, its multiplier is -k dt² times its stretch. What is solved after it moves its nodes on,
-    and what that leaves is no stretch of the material: it falls with every sweep, and with the square of the step.
-    Rubber that is drawn to twice its length has none of it.
+    Where a spring is solved, its multiplier is -k dt² times its stretch: what later solves leave besides is no stretch
+    of the material.
     """
     end, whole_end = springs.count, whole_warps(springs.count)
     found[0], found[1] = 0, 0

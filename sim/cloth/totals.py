@@ -1,7 +1,4 @@
-"""Sums and maxima over the cloths, on the device: what the diagnostics tell of every frame.
-
-Loops over lanes are serial on a CPU, where one thread has them all either way (`sim.core.scheduling`).
-"""
+"""Sums and maxima over the cloths, on the device: what the diagnostics tell of every frame."""
 
 import math
 from collections.abc import Sequence
@@ -9,8 +6,7 @@ from collections.abc import Sequence
 import taichi as ti
 
 from sim.cloth.bundles import Nodes, SpringArrays
-from sim.cloth.device_cells import DeviceCells, sum_over_cells
-from sim.cloth.device_springs import DeviceSprings, span
+from sim.cloth.device_springs import DeviceCells, DeviceSprings, span, sum_over_cells
 from sim.cloth.state import ClothState
 from sim.core.arrays import Floats, Vectors
 from sim.core.launch import kernel

@@ -3,9 +3,18 @@
 import taichi as ti
 
 from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, TriangleSystem, TriangleWork
-from sim.cloth.cells import OWN_SHARE, TRIANGLE
-from sim.cloth.device_cells import DeviceCells, change_of, derivative, mean_strain, shear_of, strain_by, tension_of
-from sim.cloth.device_springs import TINY_LENGTH
+from sim.cloth.device_springs import (
+    TINY_LENGTH,
+    DeviceCells,
+    change_of,
+    derivative,
+    mean_strain,
+    shear_of,
+    smoothed,
+    strain_by,
+    tension_of,
+)
+from sim.cloth.springs import OWN_SHARE, TRIANGLE
 from sim.cloth.state import ClothState
 from sim.cloth.threads import LARGEST_RESIDUAL, STRAIGHTENED, direction_of
 from sim.core.arrays import Floats, Vectors
@@ -36,11 +45,8 @@ class TriangleSolver:
     Forces push along the directions of the start, as threads do (`threads`), so that K consists of the stiffnesses
     along these, and of Newmark's beta of the tension that turns with them. Damping is part of both. Conjugate gradients
     with the inverse 3 x 3 blocks B of the nodes (Baraff & Witkin 1998, "Large steps in cloth simulation"), with one
-    reduction an iteration (Chronopoulos & Gear 1989). They start from the multiple of the displacement of the step
-    before that leaves the least energy: what rests stays at rest, however few they are. Their number falls with dt: a
-    wave crosses dt (E/rho)^(1/2) in a step, 14 edges of 1 cm of cotton.
-
-    What iterations leave of linear momentum is taken from each piece of a mesh that no pin holds.
+    reduction an iteration (Chronopoulos & Gear 1989), start from the multiple of the displacement of the step before
+    that leaves the least energy. What they leave of linear momentum is taken from each piece that no pin holds.
 
     Attributes:
         cloths: numbers of those that they belong to.
@@ -69,14 +75,14 @@ class TriangleSolver:
         """Mass as it is now; cells hold their stiffness."""
         self._mass = float(self._state.mass.to_numpy()[self._mesh.node.to_numpy()].sum())
 
-    def displace(self, dt: float, *, is_first: bool) -> None:
-        """Bring the displacements of a step of dt [s] to where the triangles let them go.
+    def displace(self, dt: float, rate_before: float, *, is_first: bool) -> None:
+        """Bring the displacements of a step of dt [s], after one of 1/`rate_before`, to where triangles let them go.
 
         Once more in a step: from where the nodes are now, with what triangles pushed them by so far as an impulse.
         """
         system, state = self._system, self._state
         share = self._sums.over(self._mesh.count)
-        linearize(system, state.nodes, dt)
+        linearize(system, state.nodes, dt, rate_before, int(is_first))
         begin_iteration(system, state.nodes, state.elastic, dt, int(is_first), share)
         self._left = 1.0
         if is_first:
@@ -182,10 +188,10 @@ def preconditioned(i: ti.i32, work: TriangleWork, r: ti.math.vec3) -> ti.math.ve
 
 
 @kernel
-def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32):
+def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32, rate_before: ti.f32, is_first: ti.i32):
     """Directions of each triangle, what of its tension turns with them, and its two forces times dt² [N m s²].
 
-    Damping adds tau times the rate at which the prediction strains.
+    Damping adds tau times the rate at which the prediction strains. `rate_before` is 1 over the last step.
     """
     cells, mesh, frames, work = ti.static((system.cells, system.cells.mesh, system.frames, system.work))
     for s in range(system.cells.count):
@@ -204,13 +210,17 @@ def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32):
         moved_u, moved_v = d_u - start_u, d_v - start_v
         e = ti.math.vec2(length_u - 1.0, length_v - 1.0)
         mesh.strain[s] = e + rate * ti.math.vec2(n_u.dot(moved_u), n_v.dot(moved_v))
-        shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v))
+        start_shear = shear_of(start_u, start_v)[0]
+        if is_first == 1:
+            change = rate_before * (start_shear - cells.followed[s][0])
+            cells.followed[s] = ti.math.vec2(start_shear, smoothed(cells.followed[s][1], change))
+        shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v)) - dt * cells.followed[s][1]
         shear *= cells.law[s][1]
         frames.s_u[s], frames.s_v[s] = shear * by_u, shear * by_v
         length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
         frames.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
         lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
-        pull = ROOT_HALF * cells.law[s][1] * shear_of(start_u, start_v)[0]
+        pull = ROOT_HALF * cells.law[s][1] * start_shear
         frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
     for k in range(system.cells.mesh.count):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)

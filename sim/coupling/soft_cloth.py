@@ -22,7 +22,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.proximity import closest_on_triangle, distance_to_triangle, unit_or
+from sim.cloth.contacts import closest_on_triangle, distance_to_triangle, unit_or
 from sim.cloth.solver import ClothSolver
 from sim.cloth.state import NodeLoad
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors, on_device

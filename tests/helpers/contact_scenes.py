@@ -10,8 +10,8 @@ from cloth_scenes import EARTH, FRAMES_PER_SECOND, VACUUM, cloth
 from numpy.typing import NDArray
 
 from sim.build import build_world
+from sim.cloth.contacts import ContactList
 from sim.cloth.continuous_contacts import ContinuousContacts
-from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision import SelfCollision
 from sim.cloth.solver import ClothSolver
 from sim.cloth.state import finish_step

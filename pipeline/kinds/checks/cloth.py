@@ -20,9 +20,8 @@ from pipeline.model.boxes import Box, domain_box, span, touch
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from sim.cloth.cells import cells_of
 from sim.cloth.parameters import RUNAWAY_SPEED, ClothParameters, RectangleSheet, shared_conflicts
-from sim.cloth.springs import ACCURATE_SHARE, longest_explicit_step, springs_of, too_few_substeps
+from sim.cloth.springs import ACCURATE_SHARE, cells_of, longest_explicit_step, springs_of, too_few_substeps
 from sim.cloth.start import TOUCHING, first_crossing, reach_of, too_coarse_positions
 from sim.core.domain import DomainParameters
 from sim.core.world import MAX_SUBSTEPS_PER_FRAME

@@ -16,8 +16,7 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from sim.cloth.parameters import ClothParameters, RectangleSheet
-from sim.cloth.sheet import RestSheet, build_sheet
-from sim.cloth.springs import edges_of
+from sim.cloth.sheet import RestSheet, build_sheet, edges_of
 from sim.cloth.start import pinned_nodes, start_positions
 from sim.shapes.parameters import MeshShape
 from sim.shapes.solid import ShapeError

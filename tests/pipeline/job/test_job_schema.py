@@ -13,7 +13,7 @@ from places import PROJECT
 from pipeline.job.loading import load_job
 from pipeline.job.reference import reference, with_reference
 from pipeline.job.schema import job_schema, node_at
-from sim.cloth.materials import MATERIALS
+from sim.cloth.parameters import MATERIALS
 from sim.soft.materials import Law
 
 

@@ -18,10 +18,9 @@ from cloth_scenes import (
     solver_of,
 )
 
-from sim.cloth.cells import cells_of
 from sim.cloth.parameters import RectangleSheet
 from sim.cloth.sheet import build_sheet, sheet_of_triangles
-from sim.cloth.springs import springs_of
+from sim.cloth.springs import cells_of, springs_of
 from validation.sheet_energy import cell_energies, elastic_energy
 
 LAW = {"stretch_stiffness": 300.0, "shear_stiffness": 70.0, "poisson_ratio": 0.4, "bend_stiffness": 0.0}

@@ -4,8 +4,7 @@ import pytest
 from cloth_scenes import cloth, rectangle
 from pydantic import ValidationError
 
-from sim.cloth.materials import MATERIALS
-from sim.cloth.parameters import ClothParameters, shared_conflicts
+from sim.cloth.parameters import MATERIALS, ClothParameters, shared_conflicts
 
 
 @pytest.mark.parametrize("material", sorted(MATERIALS))

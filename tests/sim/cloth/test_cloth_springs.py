@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from cloth_scenes import cloth
 
-from sim.cloth.cells import TRIANGLE, cells_of
 from sim.cloth.parameters import RectangleSheet
-from sim.cloth.sheet import RestSheet, build_sheet, sheet_of_triangles
-from sim.cloth.springs import edges_of, greedy_colours, joined, springs_of
+from sim.cloth.sheet import RestSheet, build_sheet, edges_of, sheet_of_triangles
+from sim.cloth.springs import TRIANGLE, cells_of, greedy_colours, joined, springs_of
 from sim.shapes.solid import ShapeError
 from validation.sheet_energy import cell_energies
 

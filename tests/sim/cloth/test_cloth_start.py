@@ -8,8 +8,7 @@ import pytest
 from sim.build import build_world
 from sim.cloth.continuous_contacts import RECOVERY_TIME_S
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.sheet import build_sheet
-from sim.cloth.springs import edges_of
+from sim.cloth.sheet import build_sheet, edges_of
 from sim.cloth.start import TOUCHING, first_crossing, start_positions
 from sim.scene import SceneParameters
 from validation.crossing_triangles import crossings

@@ -8,10 +8,9 @@ import taichi as ti
 from cloth_scenes import WEIGHTLESS, cloth, rectangle, solver_of
 from contact_scenes import find, listed_pairs, listed_places
 
+from sim.cloth.contacts import ContactList
 from sim.cloth.near_pairs import UNKNOWN
-from sim.cloth.patches import TRIANGLES_PER_PATCH, Patches
-from sim.cloth.proximity_contacts import ContactList
-from sim.cloth.self_collision import SelfCollision
+from sim.cloth.self_collision import TRIANGLES_PER_PATCH, Patches, SelfCollision
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 

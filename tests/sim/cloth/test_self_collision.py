@@ -17,9 +17,9 @@ from contact_scenes import (
 from thread_counts import digest_of, result_on_any_threads
 
 from sim.cloth import continuous_contacts
+from sim.cloth.contacts import EDGE_EDGE
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
-from sim.cloth.proximity_contacts import EDGE_EDGE
 from sim.cloth.self_collision import SelfCollision
 from validation.crossing_triangles import crossings, edges_of_triangles
 

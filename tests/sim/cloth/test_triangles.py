@@ -19,8 +19,8 @@ from cloth_scenes import (
 )
 from thread_counts import result_on_any_threads
 
-from sim.cloth.cells import Cells, cells_of
 from sim.cloth.sheet import sheet_of_triangles
+from sim.cloth.springs import Cells, cells_of
 from validation.sheet_energy import cell_energies
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")

@@ -7,7 +7,7 @@ import pytest
 from thread_counts import digest_of, result_on_threads
 
 from sim.build import build_world
-from sim.cloth.springs import edges_of
+from sim.cloth.sheet import edges_of
 from sim.coupling.soft_cloth import SoftClothCoupling, find_crossings, put_back, rims_of
 from sim.scene import SceneParameters
 

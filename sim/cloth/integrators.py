@@ -1,5 +1,5 @@
-"""Compliant springs with small steps: XPBD with one iteration a step (Macklin et al. 2019, "Small steps"), threads of
-rectangles and triangles of meshes as many at once.
+"""Steps of springs: compliant ones, XPBD with small steps (Macklin et al. 2019), threads of rectangles and triangles of
+meshes as many at once; and explicit forces, the reference.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -7,15 +7,27 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from sim.cloth.bundles import Nodes, SpringArrays
-from sim.cloth.cells import TRIANGLE
-from sim.cloth.device_cells import DeviceCells, damp_shears, solve_shears
-from sim.cloth.device_springs import TINY_LENGTH, Bounds, DeviceSprings, between, coefficient, separation
+from sim.cloth.device_springs import (
+    TINY_LENGTH,
+    Bounds,
+    DeviceCells,
+    DeviceSprings,
+    between,
+    coefficient,
+    compute_cell_forces,
+    damp_shears,
+    separation,
+    solve_shears,
+    span,
+)
+from sim.cloth.springs import TRIANGLE, longest_explicit_step
 from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
 from sim.cloth.triangles import TriangleSolver
-from sim.core.arrays import Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.reductions import BRANCHES, Share, Tree, device_lanes, reduced, runs_on_gpu
@@ -29,18 +41,13 @@ LEAST_INERTIA = 1.0e-6
 class AngularMomentumCorrection:
     """Takes back the angular momentum that springs gave to free cloths.
 
-    With velocities v = (x' - x)/dt, sum m x' x v = sum m x x v: a spring changes the angular momentum unless it pushes
-    along its direction d at the start of the step, as SHAKE does (Ryckaert, Ciccotti & Berendsen 1977). Springs of XPBD
-    push along where the step leads them. That is what lets them hold tension in long steps, and slows whatever spins:
-    by 1e-3 within frames where a ball is caught in cloth. Pushing along d instead is an explicit force across the
-    spring, unstable from the time on in which a wave runs along it; so the loss is returned, to each cloth as a whole:
-    its displacements get the rotation t about its centre of mass X that restores the sum over its nodes,
+    Springs that push along where the step leads them, not along their directions at its start, have a torque. So the
+    displacements of each cloth get the rotation t about its centre of mass X that restores the sum over its nodes,
 
         I t = -sum m (x - X) x e,   e_i += t x (x_i - X),
 
-    with e the displacements by springs and I the moments of inertia. Linear momentum stays, and no spring is stretched
-    to first order. Where pins hold a cloth, they have a torque of their own, and nothing is returned; nor to a mesh of
-    several pieces, as what one has lost is not the others'.
+    with e the displacements by springs and I the moments of inertia. Where pins hold a cloth, they have a torque of
+    their own, and nothing is returned; nor to a mesh of several pieces, as what one has lost is not the others'.
     """
 
     def __init__(self, state: ClothState) -> None:
@@ -133,25 +140,23 @@ class XPBDSprings:
     threads of rectangles (`threads`); and the triangles of all meshes together (`triangles`).
 
     Nodes that a spring moves in a colour belong to no other spring of it, so the result is the same whatever the number
-    of threads. Momentum of free cloth is kept to rounding. Springs push along their predicted direction rather than
-    that of the start, as implicit Euler does, and so have a torque; `AngularMomentumCorrection` takes it back
-    from cloths that no pin holds.
-
-    Approximate: one sweep a step does not let a stiff spring know of all that hangs on it. A spring alone, of a colour
-    that comes early, stretches by 2 n g dt² more than it should if n nodes hang on it, whatever its stiffness; those of
-    a thread, and triangles, by nothing. That falls with the square of the step, and with every further sweep. Bend
-    springs have one sweep always.
+    of threads. Approximate: one sweep a step does not let a stiff spring know of all that hangs on it, but within a
+    thread and between triangles. Bend springs have one sweep always.
 
     Args:
         state: what they move.
         springs: all springs.
         cells: all cells.
+
+    Attributes:
+        last_dt: length of the last step [s], 0 before the first; `usual_dt` of those that are not shortened.
     """
 
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
         self._state = state
         self._momentum = AngularMomentumCorrection(state)
         self._unconverged = 0
+        self.last_dt = self._rate_before = self.usual_dt = 0.0
         self._bends = [family for family in springs if family.arity > PAIR]
         self._shears = [family for family in cells if family.arity != TRIANGLE]
         self._triangles = [TriangleSolver(state, family) for family in cells if family.arity == TRIANGLE]
@@ -192,9 +197,8 @@ class XPBDSprings:
     def accelerate(self, dt: float) -> None:
         """Damp the velocities along springs between two nodes, and in the shear of rectangles.
 
-        Apart from their own sweep: there, a damping of gamma = tau / dt (Macklin et al. 2016, eq. 26) also brakes what
-        the sweep has to undo of the prediction, and makes their largest stiffness 1 + gamma times smaller. Bend springs
-        come first in the sweep, and what gravity predicts does not bend the cloth; they are damped there.
+        Apart from their own sweep, where a damping of gamma = tau / dt (Macklin et al. 2016, eq. 26) would make their
+        largest stiffness 1 + gamma times smaller. Bend springs are damped there.
         """
         state = self._state
         for springs in (threads.springs for threads in self._threads if threads.springs.is_damped):
@@ -209,8 +213,10 @@ class XPBDSprings:
             for bounds in bends.colours:
                 numbers = dt * dt, 1.0 / dt, bends.arity, bends.at_once
                 solve_bends(bends.on_device, bounds, self._state.nodes, *numbers)
+        self._rate_before = 1.0 / self.last_dt if self.last_dt else 0.0
         for sweep in range(sweeps.max()):
             self.sweep(dt, sweeps > sweep, shears=self._shears, is_first=sweep == 0)
+        self.last_dt = dt
         for threads in self._threads:
             threads.straighten(self._state, dt)
         self._momentum.restore(dt)
@@ -224,13 +230,14 @@ class XPBDSprings:
         for cells in shears:
             if not cloths[list(cells.cloths)].any():
                 continue
-            solve_shears(cells.on_device, cells.bounds, self._state.nodes, dt * dt, int(is_first), cells.colours)
+            steps = ti.math.vec3(dt, self._rate_before, (self.usual_dt / dt) ** 2)
+            solve_shears(cells.on_device, cells.bounds, self._state.nodes, steps, int(is_first), cells.colours)
         for threads in self._threads:
             if cloths[list(threads.springs.cloths)].any():
                 threads.displace(self._state, dt, is_first=is_first)
         for triangles in self._triangles:
             if cloths[list(triangles.cloths)].any():
-                triangles.displace(dt, is_first=is_first)
+                triangles.displace(dt, self._rate_before, is_first=is_first)
 
 
 @func
@@ -298,3 +305,95 @@ def damp_threads(springs: SpringArrays, bounds: Bounds, nodes: Nodes, dt: ti.f32
                 if squared > TINY_LENGTH * TINY_LENGTH:
                     impulse = -strength / (strength * (w_i + w_j) + 1.0) * d.dot(v_i - v_j) / squared * d
                     nodes.velocity[i], nodes.velocity[j] = v_i + w_i * impulse, v_j - w_j * impulse
+
+
+class ExplicitSprings:
+    """Forces -k (C + tau dC/dt) c_a d/|d| on the velocities, before nodes move.
+
+    Forces of springs are stored, and each node gathers its own in a fixed order.
+    """
+
+    last_dt = usual_dt = 0.0  # as of `XPBDSprings`; nothing depends on them
+
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], cells: Sequence[DeviceCells]) -> None:
+        self._state, self._springs, self._cells = state, springs, cells
+        counts = [family.count for family in springs] + [2 * family.count for family in cells]
+        self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
+        acting = [(family.host.nodes, family.host.coefficients) for family in springs]
+        for host in (family.host for family in cells):  # two forces each, which act along d_u and d_v
+            both = np.stack([host.along, host.across], axis=1).reshape(-1, host.arity)
+            acting.append((np.repeat(host.nodes, 2, axis=0), both))
+        numbered = zip(self._first[:-1], acting, strict=True)
+        forces = [np.repeat(first + np.arange(len(nodes)), nodes.shape[1]) for first, (nodes, _) in numbered]
+        nodes, coefficients = (np.concatenate([each.ravel() for each in part]) for part in zip(*acting, strict=True))
+        shape = state.vertex_count, int(self._first[-1])
+        gathered = coo_array((coefficients, (nodes, np.concatenate(forces))), shape=shape).tocsr()
+        self._start, self._spring, self._coefficient = (
+            on_device(each) for each in (gathered.indptr, gathered.indices, gathered.data)
+        )
+        self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
+
+    def take_parameters(self) -> None:
+        """Springs hold their own stiffness."""
+
+    def excess(self, dt: float) -> Callable[[], NDArray[np.float64]]:  # noqa: ARG002  (the integrators' protocol)
+        """None: springs are as long as their forces make them."""
+        return lambda: np.zeros(len(self._state.names))
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """None of its own."""
+        return {}
+
+    def stable_dt(self, cloths: NDArray[np.bool_] | None = None) -> float:
+        """Longest step that is stable for some of the cloths, or all [s]."""
+        families = [(each.host, (1.0 + each.poisson) * each.stiffness, each.damping) for each in self._springs]
+        cells = [(each.host, each.law) for each in self._cells]
+        inverse_mass = self._state.inverse_mass.to_numpy()
+        if cloths is not None:
+            inverse_mass[~cloths[self._state.host.body]] = 0.0
+        return longest_explicit_step(families, cells, inverse_mass)
+
+    def accelerate(self, dt: float) -> None:
+        """Give the springs' impulses of a step of dt [s] to the velocities."""
+        state = self._state
+        for first, springs in zip(self._first, self._springs, strict=False):
+            springs.contract(state.nodes, state.carry)
+            compute_spring_forces(springs.on_device, state.nodes, int(first), springs.arity, self._force)
+        for first, cells in zip(self._first[len(self._springs) :], self._cells, strict=False):
+            cells.measure_strains(state.nodes, is_damped=True)
+            compute_cell_forces(cells.on_device, state.nodes, int(first), cells.arity, self._force)
+        gather_spring_forces(self._start, self._spring, self._coefficient, self._force, dt, state.nodes)
+
+    def displace(self, dt: float, sweeps: NDArray[np.int64]) -> None:
+        """Displacements follow from velocities alone."""
+
+    def sweep(self, dt: float, cloths: NDArray[np.bool_]) -> None:
+        """Nor do they follow contacts."""
+
+
+@kernel
+def compute_spring_forces(springs: SpringArrays, nodes: Nodes, first: ti.i32, arity: ti.template(), force: Vectors):
+    """-k (C + tau dC/dt) d/|d| of each spring [N]."""
+    for s in range(springs.count):
+        d, rate = span(springs, nodes, nodes.carry, s, arity), ti.math.vec3(0.0)
+        for a in ti.static(range(arity)):
+            rate += coefficient(springs, s, arity, a) * nodes.velocity[springs.nodes[arity * s + a]]
+        length = d.norm()
+        value = ti.math.vec3(0.0)
+        if length > TINY_LENGTH:
+            direction = d / length
+            stretch = length - springs.law[s][0] + springs.shift[s]
+            value = -springs.law[s][1] * (stretch + springs.law[s][2] * direction.dot(rate)) * direction
+        force[first + s] = value
+
+
+@kernel
+def gather_spring_forces(
+    start: Integers, spring: Integers, coefficients: Floats, force: Vectors, dt: ti.f32, nodes: Nodes
+):
+    """Accelerate every node by its springs."""
+    for i in range(nodes.velocity.shape[0]):
+        total = ti.math.vec3(0.0)
+        for k in range(start[i], start[i + 1]):
+            total += coefficients[k] * force[spring[k]]
+        nodes.velocity[i] += dt * nodes.inverse_mass[i] * total
