@@ -25,8 +25,8 @@ Vector = ti.math.vec3
 SWEEPS = 4  # of Jacobi's rotations, which converge quadratically: off-diagonals vanish in single precision
 SMALL = 0.3  # up to which series of log1p and expm1 are taken, whose next terms are below 1e-7
 NEWTON = 6  # steps of Newton's method: the root is within twice of where it starts
-APART = math.log(2.0)
-"""Hencky strain of volume from which on sand has come apart: its grains have left their neighbours [-]."""
+APART = math.log(8.0)
+"""Hencky strain of volume from which on sand has come apart: its grains are at twice their distance [-]."""
 
 DENSE = 0.95
 """Density over that at rest from which on sand that was apart presses again [-]; below 1, as particles lie anyhow."""
