@@ -321,10 +321,16 @@ def smoothed(rate, change):
     """Smoothed rate of a cell's shear, after a change [1/s].
 
     Cells pull by the shear at the end of a step less what its smoothed rate makes of it meanwhile. Implicit Euler alone
-    brakes shear waves as a damping of as much time as a step has; so those of forty steps a turn keep 0.9997 of their
-    swing in a step instead of 0.988, and those that steps cannot follow still fall, to 0.77 in the limit.
+    brakes shear waves as a damping of as much time as a step has; so those of forty steps per period keep 0.9997 of
+    their amplitude in a step instead of 0.988, and those that steps cannot follow still fall, to 0.77 in the limit.
     """
     return rate + FOLLOWED * (change - rate)
+
+
+@ti.func
+def time_ahead(dt, rate_before):
+    """Time for which a smoothed rate counts [s]: a longer step than the last, of 1/`rate_before`, would overdo it."""
+    return 1.0 / ti.max(1.0 / dt, rate_before)
 
 
 RESOLVED = 1.5  # stiffness of a cell, as of `over_relaxed`, at which half of that rate counts
@@ -379,6 +385,7 @@ def solve_shear(
     2016, eq. 18, multiplied through by k dt². See `threads.solve_forth` for lanes.
     """
     dt, rate_before, coarsening = steps[0], steps[1], steps[2]
+    ahead = time_ahead(dt, rate_before)
     d_u, d_v, w = ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes)
     strength, before = ti.Vector.zero(ti.f32, lanes), ti.Vector.zero(ti.f32, lanes)
     start_u, start_v = ti.Matrix.zero(ti.f32, 3, lanes), ti.Matrix.zero(ti.f32, 3, lanes)
@@ -401,7 +408,7 @@ def solve_shear(
         start_shear, _, _ = shear_of(column(start_u, at), column(start_v, at))
         rate[at] = ti.select(is_first, smoothed(rate[at], rate_before * (start_shear - start[at])), rate[at])
         start[at] = ti.select(is_first, start_shear, start[at])
-        missing = strength[at] * (shear - resolved(coarsening * stiffness) * dt * rate[at]) + before[at]
+        missing = strength[at] * (shear - resolved(coarsening * stiffness) * ahead * rate[at]) + before[at]
         change = -over_relaxed(stiffness) * missing / (stiffness + 1.0)
         before[at] += change
         set_column(d_u, at, change * by_u)

@@ -13,6 +13,7 @@ from sim.cloth.device_springs import (
     smoothed,
     strain_by,
     tension_of,
+    time_ahead,
 )
 from sim.cloth.springs import OWN_SHARE, TRIANGLE
 from sim.cloth.state import ClothState
@@ -194,6 +195,7 @@ def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32, rate_before: ti.
     Damping adds tau times the rate at which the prediction strains. `rate_before` is 1 over the last step.
     """
     cells, mesh, frames, work = ti.static((system.cells, system.cells.mesh, system.frames, system.work))
+    ahead = time_ahead(dt, rate_before)
     for s in range(system.cells.count):
         start_u = derivative(cells.along, cells, nodes, nodes.carry, s, TRIANGLE)
         start_v = derivative(cells.across, cells, nodes, nodes.carry, s, TRIANGLE)
@@ -214,7 +216,7 @@ def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32, rate_before: ti.
         if is_first == 1:
             change = rate_before * (start_shear - cells.followed[s][0])
             cells.followed[s] = ti.math.vec2(start_shear, smoothed(cells.followed[s][1], change))
-        shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v)) - dt * cells.followed[s][1]
+        shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v)) - ahead * cells.followed[s][1]
         shear *= cells.law[s][1]
         frames.s_u[s], frames.s_v[s] = shear * by_u, shear * by_v
         length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)

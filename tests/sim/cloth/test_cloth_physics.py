@@ -1,6 +1,7 @@
 """Cloth against theory: what validation/cases/cloth.py does not compute, or not as strictly."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,6 +166,14 @@ def test_an_undamped_sheet_that_swings_keeps_its_energy(nodes, pins):
     assert solver.diagnostics()["max_strain"] < 0.25
 
 
+def stl_of_sheet(folder: Path) -> dict[str, str]:
+    """A sheet of a metre as a mesh of 13 x 13 vertices."""
+    vertices, triangles = _grid(13, 1.0)
+    path = folder / "sheet.stl"
+    trimesh.Trimesh(vertices - (0.5, 0.5, 0.0), triangles, process=False).export(path)
+    return {"type": "mesh", "file": str(path)}
+
+
 @pytest.mark.parametrize("kind", ["rectangle", "mesh"])
 def test_waves_of_shear_keep_their_energy_and_their_speed(kind, tmp_path):
     """The longest between two held edges, (G/rho)^(1/2) / (2 L), for five turns of 131 steps.
@@ -174,9 +183,7 @@ def test_waves_of_shear_keep_their_energy_and_their_speed(kind, tmp_path):
     """
     shape = rectangle((1.0, 1.0), (13, 13))
     if kind == "mesh":
-        shape = {"type": "mesh", "file": str(tmp_path / "sheet.stl")}
-        vertices, triangles = _grid(13, 1.0)
-        trimesh.Trimesh(vertices - (0.5, 0.5, 0.0), triangles, process=False).export(shape["file"])
+        shape = stl_of_sheet(tmp_path)
     sides = ({"type": "box", "min": (x - 0.01, -1.0, -1.0), "max": (x + 0.01, 1.0, 1.0)} for x in (-0.5, 0.5))
     pins = [{"region": side} for side in sides]
     solver = solver_of(cloth(shape=shape, pin=pins, **VACUUM, **UNDAMPED), gravity=WEIGHTLESS)
@@ -193,6 +200,21 @@ def test_waves_of_shear_keep_their_energy_and_their_speed(kind, tmp_path):
     # Again as fast as at the start, to the same side: less than an eighth of a turn off after five.
     now = solver.state.velocity.to_numpy()[:, 1]
     assert now @ velocity[:, 1] > math.sqrt(0.5) * velocity[:, 1] @ velocity[:, 1]
+
+
+@pytest.mark.parametrize("rates", [(60, 120, 240, 120), (9600, 60)], ids=["halved", "at once"])
+def test_steps_that_change_feed_no_waves_of_shear(rates, tmp_path):
+    """Of a mesh, where nothing fades out: a longer step carries the rate on no farther than the last one."""
+    solver = solver_of(cloth(shape=stl_of_sheet(tmp_path), **VACUUM, **UNDAMPED), gravity=WEIGHTLESS)
+    velocity = np.random.default_rng(7).normal(0.0, 1e-3, (solver.state.vertex_count, 3))
+    velocity[:, 2] = 0.0
+    solver.state.velocity.from_numpy(velocity.astype(np.float32))
+    start, most = energy(solver), 0.0
+    solver.begin_frame(0.0)
+    for step in range(60):
+        solver.substep(1.0 / rates[step % len(rates)])
+        most = max(most, energy(solver))
+    assert most < 1.001 * start
 
 
 @pytest.mark.slow
