@@ -5,9 +5,10 @@ strains are lost in b itself. In principal directions, which plastic flow of iso
 
     b_i = 1 + e_i,   Hencky strain h_i = ln(b_i)/2,   Kirchhoff stress tau = J sigma
 
-Sources: Simo & Hughes 1998 (return mappings), Klár et al. 2016 (sand), Stomakhin et al. 2013 (snow). The cone of sand
-goes through a slope that is about to slide, shear tan(phi) p, as in Jop et al. 2006; that of Klár et al. touches Mohr
-and Coulomb's in compression, and lets sand of 33 degrees stand at 50 in plane strain.
+Sources: Simo & Hughes 1998 (return mappings), Klár et al. 2016 (sand), Stomakhin et al. 2013 (snow), Tampubolon et al.
+2017 (volume that sand gained in tension). The cone of sand goes through a slope that is about to slide, shear
+tan(phi) p, as in Jop et al. 2006; that of Klár et al. touches Mohr and Coulomb's in compression, and lets sand of 33
+degrees stand at 50 in plane strain.
 """
 
 import math
@@ -204,19 +205,19 @@ def hardened(hardening: ti.f32, plastic: ti.f32) -> ti.f32:
 def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
     """What becomes of a trial strain e in a step of dt [s]: the elastic strain, the Kirchhoff stress [Pa], the history.
 
-    The history is the Hencky strain of volume that sand which is apart has gained, or that snow lost for good.
+    The history is the Hencky strain of volume that sand in tension has gained, or that snow lost for good.
     """
     law, mu, lam = laws.law[b], laws.mu[b], laws.lam[b]
     e, stress, told = trial, Matrix(0.0), history
-    apart = -1.0
+    gained = -1.0
     if law == ti.static(int(Law.SAND)):
-        apart = volume_strain(trial) + history - laws.tip[b]
+        gained = volume_strain(trial) + history - laws.tip[b]
     if law == ti.static(int(Law.ELASTIC)):
         stress = neo_hookean(trial, mu, lam)
-    elif apart >= 0.0:
+    elif gained >= 0.0:
         # Its strain goes to the tip of the cone; it presses again only once it is that much denser.
         tip = laws.tip[b]
-        e, stress, told = spherical(expm1(2.0 / 3.0 * tip)), spherical((2.0 / 3.0 * mu + lam) * tip), apart
+        e, stress, told = spherical(expm1(2.0 / 3.0 * tip)), spherical((2.0 / 3.0 * mu + lam) * tip), gained
     else:
         values, axes = principal(trial)
         strain = Vector(0.0)

@@ -208,7 +208,8 @@ class SoftSolver:
         particles, grid = self.particles, self._grid
         if self._pouring is not None and self._pouring.let_in(particles, self._time_s):
             grid.moved(math.inf)
-            self._measure()
+            if self._has_sand:
+                self._measure()
         self._time_s += dt
         if self._forces.accelerates:
             push_particles(particles, self._forces.now, dt)

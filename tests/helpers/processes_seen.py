@@ -22,10 +22,10 @@ def pid_lives(pid: int) -> bool:
 
 
 def words_of(process: psutil.Process) -> list[str]:
-    """The words of its command line; none once it has ended."""
+    """The words of its command line; none once it has ended, or where others may not know them."""
     try:
         return list(process.cmdline())
-    except psutil.NoSuchProcess:
+    except (psutil.NoSuchProcess, psutil.AccessDenied):
         return []
 
 
@@ -53,6 +53,6 @@ def busiest(count: int = 6, within_s: float = 0.5) -> list[str]:
 def _seconds(process: psutil.Process) -> float:
     try:
         times = process.cpu_times()
-    except psutil.NoSuchProcess:
+    except (psutil.NoSuchProcess, psutil.AccessDenied):
         return 0.0
     return float(times.user + times.system)

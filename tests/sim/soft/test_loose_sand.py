@@ -32,7 +32,7 @@ def test_a_wall_leaves_a_node_the_part_of_its_spline_before_it():
     np.testing.assert_allclose(found.to_numpy(), expected, atol=1e-4)
 
 
-def test_poured_sand_fills_a_box_as_densely_as_sand_that_was_there():
+def test_poured_sand_rests_at_two_thirds_of_its_density_or_more():
     """Layers that fall one after the other are a cell apart when the grid first lets them touch.
 
     Half a spacing above a layer that is dense, the next one counts as dense with it: two thirds are found of those that
@@ -55,4 +55,4 @@ def test_poured_sand_fills_a_box_as_densely_as_sand_that_was_there():
     told = world.snapshots()["sand"].arrays
     assert len(told["position"]) == round(SIDE * SIDE * high / (0.5 * CELL) ** 3)
     assert np.linalg.norm(told["velocity"], axis=1).mean() < 0.02
-    assert 0.5 * high / told["position"][:, 2].mean() == pytest.approx(1.0, abs=0.4)
+    assert 0.62 < 0.5 * high / told["position"][:, 2].mean() < 1.05
