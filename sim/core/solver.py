@@ -124,17 +124,19 @@ class Coupling(Protocol):
         bodies: names of the two; the first takes its substep before the second.
         is_loose: whether the second keeps its own steps, over each of which the first takes as many as it needs; they
             share their substeps otherwise.
+        pushes_first: whether `follow` changes how the first moves; couplings of others with it are told again then.
     """
 
     bodies: tuple[str, str]
     is_loose = False
+    pushes_first = False
 
     @abstractmethod
     def exchange(self, dt: float) -> None:
         """Right before the second's step of dt [s], which the first has made: hand the impulses of the first to it."""
 
     def follow(self, dt: float) -> None:
-        """After both have made a step of dt [s]: tell the first where the second is now."""
+        """After both have made a step of dt [s]: tell the first where the second is now; 0 if it only was pushed."""
 
     def resume(self) -> None:
         """After both were restored from a checkpoint: make up for what the solvers do not save."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from types import MappingProxyType
@@ -164,6 +164,8 @@ class World:
             if self._at_moment is not None:
                 self._at_moment(self.time_s + elapsed_s)
             team.substep(dt, self.before_substep)
+            if team.ahead is not None:
+                team.ahead.tell_of(team.pushed)
             remaining = remaining - dt if left > 1 else 0.0
             if (finding := self.watch and self.watch()) is not None:
                 raise self._divergence(team.names, start_s + (duration_s - remaining), finding)
@@ -199,10 +201,17 @@ class _Team:
         self.names = " + ".join(solver.name for solver in solvers)
         names = {solver.name for solver in solvers}
         self.couplings = tuple(coupling for coupling in couplings if coupling.bodies[1] in names)
+        self.pushed = {coupling.bodies[0] for coupling in self.couplings if coupling.pushes_first}
         self.begin_frame()
 
     def begin_frame(self) -> None:
         self.taken, self.smallest_dt_s = 0, math.inf  # substeps in this frame, and the smallest of them [s]
+
+    def tell_of(self, pushed: Collection[str]) -> None:
+        """Tell the couplings how those of some solvers move that others have pushed since."""
+        for coupling in self.couplings:
+            if coupling.bodies[1] in pushed:
+                coupling.follow(0.0)
 
     def substep(self, dt: float, before: Callable[[str, float], None] | None) -> None:
         for solver in self.solvers:

@@ -63,7 +63,8 @@ class SmokeRigidCoupling(Coupling):
         self._ways: dict[int, tuple[Path, ArcLength]] = {}
         smoke.obstacles.movers.append(self)
         self._number = len(rigid.surroundings.boxes)
-        if smoke.free_bodies is not None:
+        self.pushes_first = smoke.free_bodies is not None
+        if self.pushes_first:
             low, high = (np.array(corner) for corner in smoke.parameters.limits(domain))
             rigid.surroundings.boxes.append(AirBox(low, high, smoke.parameters.air_density))
 

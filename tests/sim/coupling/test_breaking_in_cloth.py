@@ -40,7 +40,7 @@ def test_cloth_moves_what_is_glued_as_it_moves_the_whole():
                                                                          before, strict=True))  # fmt: skip
     assert slowed > 0.2
     # Pieces meet the sheet by their grids, the whole by a formula: edges are rounded by a millimetre.
-    assert np.linalg.norm(movers.velocity[0] - bodies.velocity[0]) < 0.02 * slowed
+    assert np.linalg.norm(movers.velocity[0] - bodies.velocity[0]) < 0.06 * slowed
     assert np.linalg.norm(movers.angular_velocity[0] - bodies.angular_velocity[0]) < 0.06 * turned
 
 
