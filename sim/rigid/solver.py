@@ -418,7 +418,7 @@ class RigidSolver:
         awake = bodies.is_free & ~bodies.is_asleep
         slow = speeds <= SLEEP_SHARE * LARGEST_DT * float(np.linalg.norm(self.gravity))
         bodies.rest_s = np.where(awake & slow, bodies.rest_s + dt, 0.0)
-        rests = awake & (bodies.rest_s >= SLEEP_TIME_S)
+        rests = awake & (bodies.rest_s >= SLEEP_TIME_S) & ~self.surroundings.stirs(self.gravity)
         if not rests.any() or not self.gravity.any():
             return
         # Those that would wake each other rest together.
@@ -434,7 +434,9 @@ class RigidSolver:
         np.logical_or.at(restless, groups, awake & ~rests)
         for one, two in ((first, second), (second, first)):
             restless[groups[one[free[one] & leads[two]]]] = True
-        bodies.put_to_sleep(rests & ~restless[groups])
+        stopped = rests & ~restless[groups]
+        bodies.put_to_sleep(stopped)
+        self.surroundings.forget(stopped)
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
@@ -540,6 +542,7 @@ class RigidSolver:
                 lost = np.bincount(self.glue.leader, weights=lost)[self.glue.leader] > 0.0
                 self.glue.movers.is_lost |= lost
             self.bodies.is_lost |= lost
+            self.surroundings.forget(lost)
             self.bodies.velocity[lost] = 0.0
             self.bodies.angular_velocity[lost] = 0.0
 

@@ -5,6 +5,7 @@ import pytest
 from thread_counts import digest_of, result_on_any_threads
 
 from sim.build import build_world
+from sim.rigid.surroundings import AirBox
 from sim.scene import SceneParameters
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -188,6 +189,54 @@ def test_bodies_at_rest_sleep_in_still_air_and_wake_in_a_storm():
         world.advance_frame()
     assert not bodies_of(world).is_asleep.any()
     assert bodies_of(world).position[0, 0] - place[0, 0] > 0.01
+
+
+def block_in_steady_pressure():
+    """A block of friction 0.5 on a floor, and a step [s] with a pressure of 0.3 g along x, whatever the block does."""
+    block = {"name": "block", "kind": "dynamic", "density": 400.0, "shape": {"type": "box", "size": (0.2, 0.2, 0.2)}}
+    floor = {"name": "floor", "kind": "static", "shape": {"type": "box", "size": (2.0, 2.0, 0.2)}}
+    bodies = [{**block, "position": (0.5, 0.5, 0.2)}, {**floor, "position": (0.5, 0.5, 0.0)}]
+    scene = {"domain": {"min": (0.0, 0.0, 0.0), "max": (1.0, 1.0, 1.0), "open_faces": SIDES}, "rigid": bodies}
+    rigid = build_world(SceneParameters.model_validate(scene), frames_per_second=60.0).solvers["rigid"]
+    rigid.surroundings.boxes.append(AirBox(np.zeros(3), np.ones(3), 0.0))
+
+    def step(dt, pressure=0.3):
+        rigid.substep(dt)
+        impulses = np.array([[pressure * G * rigid.bodies.mass[0] * dt, 0.0, 0.0, 0.0, 0.0, 0.0]])
+        inverse_mass, inverse_inertia = rigid.mobility()
+        if rigid.bodies.is_asleep[0]:
+            inverse_mass[:], inverse_inertia[:] = 0.0, 0.0
+        rigid.surroundings.settle(0, impulses, (inverse_mass, inverse_inertia), dt)
+
+    return rigid, step
+
+
+def test_a_block_that_friction_holds_in_wind_stays_awake_and_where_it_is():
+    rigid, step = block_in_steady_pressure()
+    for _ in range(30):
+        step(1.0 / 240.0)
+    place = rigid.bodies.position.copy()
+    for _ in range(480):
+        step(1.0 / 240.0)
+        assert not rigid.bodies.is_asleep.any()
+    np.testing.assert_allclose(rigid.bodies.position, place, atol=1.0e-6)
+
+
+@pytest.mark.parametrize("is_woken_by_others", [False, True], ids=["by the air", "by others"])
+def test_a_body_that_wakes_gets_the_push_of_the_air_once(is_woken_by_others):
+    rigid, step = block_in_steady_pressure()
+    rigid.surfaces.friction[:] = 0.0
+    dt = 1.0 / 240.0
+    while not rigid.bodies.is_asleep[0]:
+        step(dt, 0.0)
+    pressure = 0.05 if is_woken_by_others else 0.3
+    step(dt, pressure)
+    assert rigid.bodies.is_asleep[0]
+    if is_woken_by_others:
+        rigid.bodies.wake(np.array([True]))
+    for steps in (1, 2, 3):
+        step(dt, pressure)
+        assert rigid.bodies.velocity[0, 0] == pytest.approx(steps * dt * pressure * G, rel=1.0e-6)
 
 
 def test_pieces_feel_the_air_as_what_they_hold_together_to():
