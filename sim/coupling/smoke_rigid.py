@@ -42,7 +42,8 @@ class SmokeRigidCoupling(Coupling):
     as `RigidSolver.mobility` does; bodies that rest asleep, and that joints hold to what stands, do not. The level of
     pressure in a closed room is arbitrary: it matters only where bodies touch, which shuts the air out there.
 
-    A body feels the first smoke in whose box its centre of mass is, and is in the way of all.
+    A body feels the first smoke in whose box its centre of mass is, and is in the way of all. Beyond a window, where
+    bodies may sleep, winds act on them themselves; what they wake is in the window from the next frame on.
 
     Steps are cut so that no body gets farther than a cell within the box: along its path if it is kinematic, with its
     velocity and gravity if it is dynamic; one outside has the way to the box to go first. What collisions, water, air
@@ -65,7 +66,8 @@ class SmokeRigidCoupling(Coupling):
         self._number = len(rigid.surroundings.boxes)
         if smoke.free_bodies is not None:
             low, high = (np.array(corner) for corner in smoke.parameters.limits(domain))
-            rigid.surroundings.boxes.append(AirBox(low, high, smoke.parameters.air_density))
+            box = AirBox(low, high, smoke.parameters.air_density, lambda: (smoke.grid.origin, smoke.grid.upper))
+            rigid.surroundings.boxes.append(box)
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no body gets farther than a cell in the box, as far as is foreseen."""

@@ -32,7 +32,7 @@ from sim.rigid.parts import PartsDetector, detector_of
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies, lengths
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
-from sim.rigid.surroundings import NOWHERE, Surroundings
+from sim.rigid.surroundings import Surroundings
 from sim.shapes.body_geometry import BodyGeometry
 
 LARGEST_DT = 2.0e-3
@@ -220,7 +220,7 @@ class RigidSolver:
         """Advance by dt [s]; groups of bodies that are too fast for it by several steps of their own."""
         bodies, start_s = self.bodies, self.time_s
         if self._outer_forces is not None:
-            self._outer_forces.push(bodies, self.gravity, dt, self.surroundings.where() != NOWHERE)
+            self._outer_forces.push(bodies, self.gravity, dt, self.surroundings.surrounded())
             if self.glue is not None:
                 self.glue.share()
         if self.surroundings.boxes:

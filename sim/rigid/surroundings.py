@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,11 +25,25 @@ FELT = "air_felt"
 
 @dataclass(frozen=True)
 class AirBox:
-    """A box of air, without end where its corners are infinite."""
+    """A box of air, without end where its corners are infinite; part of it is computed, elsewhere air is at rest."""
 
     low: Array  # lower corner [m], (3,)
     high: Array
     density: float  # [kg/m³]
+    computed: Callable[[], tuple[Sequence[float], Sequence[float]]]  # corners now of what is [m]
+
+    def has(self, places: Array) -> NDArray[np.bool_]:
+        """Which of some places [m], (n, 3), are in it."""
+        return _between(places, self.low, self.high)
+
+    def computes(self, places: Array) -> NDArray[np.bool_]:
+        """Which of some places [m], (n, 3), are in what is computed."""
+        return _between(places, *self.computed())
+
+
+def _between(places: Array, low: Array | Sequence[float], high: Array | Sequence[float]) -> NDArray[np.bool_]:
+    result: NDArray[np.bool_] = ((places >= np.asarray(low)) & (places <= np.asarray(high))).all(axis=1)
+    return result
 
 
 class Surroundings:
@@ -65,8 +79,16 @@ class Surroundings:
         place = self._movers.position[self._leader]
         found = np.full(len(place), NOWHERE)
         for number, box in reversed(list(enumerate(self.boxes))):
-            found[((place >= box.low) & (place <= box.high)).all(axis=1)] = number
+            found[box.has(place)] = number
         return found
+
+    def surrounded(self) -> NDArray[np.bool_]:
+        """Whether each body is where the air of its box is computed now, (n,)."""
+        place, where = self._movers.position[self._leader], self.where()
+        result = np.zeros(len(place), dtype=bool)
+        for number, box in enumerate(self.boxes):
+            result |= (where == number) & box.computes(place)
+        return result
 
     def push(self, gravity: Array, dt: float) -> None:
         """Let air act on dynamic bodies for dt [s]."""

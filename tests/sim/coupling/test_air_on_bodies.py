@@ -191,6 +191,26 @@ def test_bodies_at_rest_sleep_in_still_air_and_wake_in_a_storm():
     assert bodies_of(world).position[0, 0] - place[0, 0] > 0.01
 
 
+def test_a_wind_wakes_what_sleeps_beyond_the_window():
+    """Which went away to a source, once that had smoke."""
+    source = {"shape": {"type": "sphere", "radius": 0.12}, "position": (0.2, 0.5, 0.5), "start_s": 0.7}
+    block = {"name": "block", "kind": "dynamic", "density": 4.0, "shape": {"type": "box", "size": (0.2, 0.2, 0.2)}}
+    floor = {"name": "floor", "kind": "static", "shape": {"type": "box", "size": (4.0, 2.0, 0.2)}}
+    bodies = [{**block, "position": (1.7, 0.5, 0.2)}, {**floor, "position": (1.0, 0.5, 0.0)}]
+    storm = {"type": "wind", "velocity": (8.0, 0.0, 0.0), "start_s": 1.0}
+    smoke = {"grid": "window", "source": [source]}
+    world = build(bodies, cells=32, size=(2.0, 1.0, 1.0), fps=15.0, forces=[storm], **smoke)
+    for _ in range(15):
+        world.advance_frame()
+    assert bodies_of(world).is_asleep.all()
+    world.advance_frame()
+    assert world.solvers["air"].grid.upper[0] < 1.6
+    assert not bodies_of(world).is_asleep.any()
+    assert bodies_of(world).velocity[0, 0] > 0.5
+    world.advance_frame()
+    assert world.solvers["air"].grid.upper[0] > 1.8
+
+
 def block_in_steady_pressure():
     """A block of friction 0.5 on a floor, and a step [s] with a pressure of 0.3 g along x, whatever the block does."""
     block = {"name": "block", "kind": "dynamic", "density": 400.0, "shape": {"type": "box", "size": (0.2, 0.2, 0.2)}}
@@ -198,7 +218,8 @@ def block_in_steady_pressure():
     bodies = [{**block, "position": (0.5, 0.5, 0.2)}, {**floor, "position": (0.5, 0.5, 0.0)}]
     scene = {"domain": {"min": (0.0, 0.0, 0.0), "max": (1.0, 1.0, 1.0), "open_faces": SIDES}, "rigid": bodies}
     rigid = build_world(SceneParameters.model_validate(scene), frames_per_second=60.0).solvers["rigid"]
-    rigid.surroundings.boxes.append(AirBox(np.zeros(3), np.ones(3), 0.0))
+    corners = np.zeros(3), np.ones(3)
+    rigid.surroundings.boxes.append(AirBox(*corners, 0.0, lambda: corners))
 
     def step(dt, pressure=0.3):
         rigid.substep(dt)
