@@ -122,7 +122,8 @@ class SmokeRigidCoupling(Coupling):
         centre, reach = self._boxes(bodies.rotation())
         way = duration_s * bodies.velocity
         low, high = centre - reach + np.minimum(way, 0.0), centre + reach + np.maximum(way, 0.0)
-        return list(np.stack([low, high], axis=1)[moves])
+        boxes = np.stack([low, high], axis=1)
+        return list(boxes[moves & np.isfinite(boxes).all(axis=(1, 2))])
 
     def follow(self, dt: float) -> None:
         """Hand the impulses of the air in a step of dt [s] to the bodies."""
@@ -131,11 +132,16 @@ class SmokeRigidCoupling(Coupling):
             self._rigid.surroundings.settle(self._number, impulses, self._mobility(), dt)
 
     def _corners(self, turned: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Lowest and highest corner, counted from 1, in each body's box and `MARGIN` beyond, (n, 2, 3)."""
+        """Lowest and highest corner, counted from 1, in each body's box and `MARGIN` beyond, (n, 2, 3).
+
+        None, one above the other, of a body whose pose is not finite: the world's look at the state names it.
+        """
         grid = self._smoke.grid
         centre, reach = self._boxes(turned)
         first = np.ceil((centre - reach - grid.origin) / grid.cell_size + 1.0 - MARGIN)
         last = np.floor((centre + reach - grid.origin) / grid.cell_size + 1.0 + MARGIN)
+        is_bad = ~np.isfinite(first + last).all(axis=1)
+        first[is_bad], last[is_bad] = np.inf, -np.inf
         low, high = np.clip(first, 1, np.add(grid.cells, 2)), np.clip(last, 0, np.add(grid.cells, 1))
         return np.stack([low, high], axis=1).astype(np.int64)
 

@@ -5,6 +5,7 @@ import pytest
 from thread_counts import digest_of, result_on_any_threads
 
 from sim.build import build_world
+from sim.core.solver import SimulationDivergedError
 from sim.rigid.surroundings import AirBox
 from sim.scene import SceneParameters
 
@@ -299,6 +300,20 @@ def test_a_window_goes_with_a_body_that_falls():
     assert np.all(place + 0.1 < np.array(grid.upper))
     fallen = 2.6 - place[2]
     assert 0.5 * G * 0.2**2 * 0.5 < fallen < 0.5 * G * 0.2**2 * 0.72  # 0.68 of it by lift and added mass
+
+
+@pytest.mark.parametrize(("quantity", "value"), [("position", np.nan), ("position", np.inf), ("orientation", np.nan)])
+def test_a_body_whose_pose_is_not_finite_is_not_in_the_air_and_is_named(quantity, value):
+    world = build([ball(0.1, 5.0, (0.5, 0.5, 0.5))], cells=24, size=(1.0, 1.0, 1.0), grid="window")
+    air = world.solvers["air"]
+    getattr(bodies_of(world), quantity)[0, 1] = value
+    with np.errstate(invalid="raise"):  # as where no number becomes a whole one
+        for mover in air.obstacles.movers:
+            mover.exchange(0.01)
+            assert mover.reach(0.01) == []
+    assert air.free_bodies.carried.row_count == 0
+    with pytest.raises(SimulationDivergedError, match=f'{quantity} of "ball" is not finite'):
+        world.advance_frame()
 
 
 def test_scenes_without_dynamic_bodies_have_no_air_that_pushes():
