@@ -42,7 +42,8 @@ class SmokeRigidCoupling(Coupling):
     as `RigidSolver.mobility` does; bodies that rest asleep, and that joints hold to what stands, do not. The level of
     pressure in a closed room is arbitrary: it matters only where bodies touch, which shuts the air out there.
 
-    A body feels the first smoke in whose box its centre of mass is, and is in the way of all.
+    A body feels the first smoke in whose box its centre of mass is, and is in the way of all. Beyond a window, where
+    bodies may sleep, winds act on them themselves; what they wake is in the window from the next frame on.
 
     Steps are cut so that no body gets farther than a cell within the box: along its path if it is kinematic, with its
     velocity and gravity if it is dynamic; one outside has the way to the box to go first. What collisions, water, air
@@ -66,7 +67,8 @@ class SmokeRigidCoupling(Coupling):
         self.pushes_first = smoke.free_bodies is not None
         if self.pushes_first:
             low, high = (np.array(corner) for corner in smoke.parameters.limits(domain))
-            rigid.surroundings.boxes.append(AirBox(low, high, smoke.parameters.air_density))
+            box = AirBox(low, high, smoke.parameters.air_density, lambda: (smoke.grid.origin, smoke.grid.upper))
+            rigid.surroundings.boxes.append(box)
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no body gets farther than a cell in the box, as far as is foreseen."""
@@ -121,7 +123,8 @@ class SmokeRigidCoupling(Coupling):
         centre, reach = self._boxes(bodies.rotation())
         way = duration_s * bodies.velocity
         low, high = centre - reach + np.minimum(way, 0.0), centre + reach + np.maximum(way, 0.0)
-        return list(np.stack([low, high], axis=1)[moves])
+        boxes = np.stack([low, high], axis=1)
+        return list(boxes[moves & np.isfinite(boxes).all(axis=(1, 2))])
 
     def follow(self, dt: float) -> None:
         """Hand the impulses of the air in a step of dt [s] to the bodies."""
@@ -130,11 +133,16 @@ class SmokeRigidCoupling(Coupling):
             self._rigid.surroundings.settle(self._number, impulses, self._mobility(), dt)
 
     def _corners(self, turned: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Lowest and highest corner, counted from 1, in each body's box and `MARGIN` beyond, (n, 2, 3)."""
+        """Lowest and highest corner, counted from 1, in each body's box and `MARGIN` beyond, (n, 2, 3).
+
+        None, one above the other, of a body whose pose is not finite: the world's look at the state names it.
+        """
         grid = self._smoke.grid
         centre, reach = self._boxes(turned)
         first = np.ceil((centre - reach - grid.origin) / grid.cell_size + 1.0 - MARGIN)
         last = np.floor((centre + reach - grid.origin) / grid.cell_size + 1.0 + MARGIN)
+        is_bad = ~np.isfinite(first + last).all(axis=1)
+        first[is_bad], last[is_bad] = np.inf, -np.inf
         low, high = np.clip(first, 1, np.add(grid.cells, 2)), np.clip(last, 0, np.add(grid.cells, 1))
         return np.stack([low, high], axis=1).astype(np.int64)
 

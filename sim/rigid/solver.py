@@ -32,7 +32,7 @@ from sim.rigid.parts import PartsDetector, detector_of
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies, lengths
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
-from sim.rigid.surroundings import NOWHERE, Surroundings
+from sim.rigid.surroundings import Surroundings
 from sim.shapes.body_geometry import BodyGeometry
 
 LARGEST_DT = 2.0e-3
@@ -220,7 +220,7 @@ class RigidSolver:
         """Advance by dt [s]; groups of bodies that are too fast for it by several steps of their own."""
         bodies, start_s = self.bodies, self.time_s
         if self._outer_forces is not None:
-            self._outer_forces.push(bodies, self.gravity, dt, self.surroundings.where() != NOWHERE)
+            self._outer_forces.push(bodies, self.gravity, dt, self.surroundings.surrounded())
             if self.glue is not None:
                 self.glue.share()
         if self.surroundings.boxes:
@@ -418,7 +418,7 @@ class RigidSolver:
         awake = bodies.is_free & ~bodies.is_asleep
         slow = speeds <= SLEEP_SHARE * LARGEST_DT * float(np.linalg.norm(self.gravity))
         bodies.rest_s = np.where(awake & slow, bodies.rest_s + dt, 0.0)
-        rests = awake & (bodies.rest_s >= SLEEP_TIME_S)
+        rests = awake & (bodies.rest_s >= SLEEP_TIME_S) & ~self.surroundings.stirs(self.gravity)
         if not rests.any() or not self.gravity.any():
             return
         # Those that would wake each other rest together.
@@ -434,7 +434,9 @@ class RigidSolver:
         np.logical_or.at(restless, groups, awake & ~rests)
         for one, two in ((first, second), (second, first)):
             restless[groups[one[free[one] & leads[two]]]] = True
-        bodies.put_to_sleep(rests & ~restless[groups])
+        stopped = rests & ~restless[groups]
+        bodies.put_to_sleep(stopped)
+        self.surroundings.forget(stopped)
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
@@ -540,6 +542,7 @@ class RigidSolver:
                 lost = np.bincount(self.glue.leader, weights=lost)[self.glue.leader] > 0.0
                 self.glue.movers.is_lost |= lost
             self.bodies.is_lost |= lost
+            self.surroundings.forget(lost)
             self.bodies.velocity[lost] = 0.0
             self.bodies.angular_velocity[lost] = 0.0
 

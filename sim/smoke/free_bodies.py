@@ -61,7 +61,8 @@ class FreeBodies:
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self.carried = with_room(Carried, count, row_count=0, first_row=ti.ndarray(ti.i32, count + 1))
+        rows, first_row = ti.ndarray(ti.i32, ROW * max(count, 1)), ti.ndarray(ti.i32, count + 1)
+        self.carried = with_room(Carried, count, rows=rows, row_count=0, first_row=first_row)
         self._impulses, self._unit, self._cell_size = np.zeros((count, 6)), 0.0, 1.0
 
     def place(

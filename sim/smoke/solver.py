@@ -255,28 +255,37 @@ class SmokeSolver:
             self._follow_obstacles()
 
     def give_way(self) -> None:
-        """Let air at rest flow as obstacles move now, and bodies keep their velocities: others have set them going."""
-        for mover in self.obstacles.movers:
-            mover.exchange(0.0)
-        self.move_obstacles()  # once more: faces are open as between two commits
-        if self.free_bodies is not None:
-            self.free_bodies.hold()
-        self._projection.project()
-        self._extrapolation.fill()
+        """Let air at rest flow as obstacles move now, and bodies keep their velocities: others have set them going.
+
+        A window is fitted to the bodies, and then to the flow around them.
+        """
+        for _ in range(2 if self._fitting.follows else 1):
+            self._fit_window()
+            for mover in self.obstacles.movers:
+                mover.exchange(0.0)
+            self.move_obstacles()  # once more: faces are open as between two commits
+            if self.free_bodies is not None:
+                self.free_bodies.hold()
+            self._projection.project()
+            self._extrapolation.fill()
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]; a window is fitted to what is there."""
         self.time_s = time_s
         self._projections: list[ProjectionReport] = []
+        self._fit_window()
+        if self.guide is not None:
+            self.guide.begin_frame(time_s, self.refusal)
+
+    def _fit_window(self) -> None:
+        """Compute, from now on, in a window that fits the coming frame."""
         if self._fitting.follows:
-            frame = time_s, time_s + self._frame_s
+            frame = self.time_s, self.time_s + self._frame_s
             there = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
             there += [box for mover in self.obstacles.movers for box in mover.reach(self._frame_s)]
             fuel = None if self._combustion is None else self._combustion.fuel
             given = self.grid.window, self._outside.velocity, there, self._rows
             self._move_window(self._fitting.next(self.air, fuel, *given))
-        if self.guide is not None:
-            self.guide.begin_frame(time_s, self.refusal)
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Density, temperature and velocity at cell centres; solid cells hold no smoke."""

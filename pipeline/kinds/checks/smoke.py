@@ -26,6 +26,7 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, Problem, format_path, unknown_name
 from sim.core.motion.paths import path_through
+from sim.core.parameters import Vector3
 from sim.rigid.paths import path_of
 from sim.shapes.placement import PlacedSolid
 from sim.shapes.solid import Solid
@@ -218,9 +219,11 @@ def _check_size(
 
 
 def _check_first_window(job: Job, index: int, solids: Solids, budget: MemoryBudget, findings: Findings) -> None:
-    """Note sources that lie so far apart that no window around them fits."""
+    """Note sources, and bodies that its air pushes, that lie so far apart that no window around them fits."""
     smoke = job.smoke[index]
     paths: list[KeyPath] = [("smoke", index, "source", number) for number in range(len(smoke.source))]
+    pushed = [("rigid", number) for number in _bodies_pushed(job, index)]
+    paths += pushed
     bounds = [solids[path].bounds for path in paths if path in solids]
     if not bounds:
         return
@@ -230,10 +233,25 @@ def _check_first_window(job: Job, index: int, solids: Solids, budget: MemoryBudg
     if size_bytes > budget.bytes:
         findings.error(
             ("smoke", index, "grid"),
-            f"{count(float(np.prod(layers)))} cells lie in one window around all sources, and need "
-            f"{gigabytes(size_bytes)}; {budget.owner} has {gigabytes(budget.bytes)}; give sources that are far apart a "
-            "smoke each, or use a larger cell_size",
+            f"{count(float(np.prod(layers)))} cells lie in one window around all sources"
+            f"{' and dynamic bodies' if pushed else ''}, and need {gigabytes(size_bytes)}; {budget.owner} has "
+            f"{gigabytes(budget.bytes)}; give sources that are far apart a smoke each, "
+            f"{'bodies far from them a smaller box of smoke, ' if pushed else ''}or use a larger cell_size",
         )
+
+
+def _bodies_pushed(job: Job, index: int) -> list[int]:
+    """Dynamic bodies, by number, that start in the box of a smoke, and of none before it."""
+    *before, own = (np.array(smoke.limits(job.domain)) for smoke in job.smoke[: index + 1])
+
+    def has(box: Box, place: Vector3) -> bool:
+        return bool(np.all((box[0] <= place) & (place <= box[1])))
+
+    return [
+        number
+        for number, body in enumerate(job.rigid)
+        if body.kind == "dynamic" and has(own, body.position) and not any(has(box, body.position) for box in before)
+    ]
 
 
 def _bytes_of(layers: NDArray[np.float64], smoke: SmokeParameters, *, on_gpu: bool) -> float:

@@ -134,3 +134,15 @@ def test_what_is_held_gets_impulses_and_does_not_yield():
 def test_heavy_bodies_take_no_more_iterations_than_held_ones():
     counts = [BallsInAir(20, CLOSED_BOX, (2000.0, 2000.0)).project(held=held).iterations for held in (True, False)]
     assert counts[1] <= counts[0] + 1
+
+
+def test_there_is_room_for_more_rows_of_cells_than_a_fifth_of_the_bodies():
+    """One of 40 bodies, three cells wide, is in the air: 25 rows, each of five numbers."""
+    count, obstacles = 40, Obstacles(unit_grid((8, 8, 8), OPEN_BOX), moving=True, carries=True)
+    bodies = FreeBodies(count)
+    corners = np.tile([[2**31 - 1] * 3, [-1] * 3], (count, 1, 1))
+    corners[7] = [[3, 3, 3], [6, 6, 6]]
+    bodies.place(obstacles, corners, np.full((count, 3), 0.5), np.ones(count), np.tile(np.eye(3), (count, 1, 1)), AIR)
+    rows = bodies.carried.rows.to_numpy()[: 5 * bodies.carried.row_count].reshape(-1, 5)
+    beside = range(2, 7)
+    assert rows.tolist() == [[7, i, j, 2, 6] for i in beside for j in beside]

@@ -17,6 +17,18 @@ particle_radius = 0.02
 shape = { type = "box", size = [0.2, 0.2, 0.2] }
 position = [0.0, 0.0, 0.2]
 """
+SMOKE = """
+[[smoke]]
+name = "air"
+cell_size = 0.02
+min = [-0.3, -0.3, 0.3]
+max = [0.3, 0.3, 0.9]
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.7]
+"""
+BLOCK = LEAF.replace("0.01]", "0.1]")
+BESIDE = BLOCK.replace('"leaf"', '"far"').replace("[0.0, 0.0, 0.5]", "[0.4, 0.0, 0.5]")
 
 
 def warnings_of(tmp_path, force, bodies):
@@ -38,6 +50,10 @@ def warnings_of(tmp_path, force, bodies):
             "is the place meant?",
         ),
         ('type = "wind"', LEAF, None),
+        ('type = "wind"\nonly = ["leaf"]', BLOCK + SMOKE, 'in place of this air; add "air"'),
+        ('type = "wind"\nonly = ["leaf", "air"]', BLOCK + SMOKE, None),
+        ('type = "wind"\nonly = ["leaf", "far"]', BLOCK + BESIDE + SMOKE, None),
+        ('type = "drag"\nrate = 1.0\nonly = ["leaf"]', BLOCK + SMOKE, None),
     ],
 )
 def test_forces_that_change_nothing_are_told(tmp_path, force, bodies, said):

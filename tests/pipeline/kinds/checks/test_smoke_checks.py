@@ -234,6 +234,18 @@ def test_a_window_needs_memory_for_its_sources_and_not_for_its_box(grid, tmp_pat
         load_checked_job(path)
 
 
+def test_a_window_needs_memory_for_the_bodies_that_its_air_pushes(tmp_path):
+    """A body at the other end of a box of ten thousand cells along each edge; a smaller box leaves it out."""
+    path, body = tmp_path / "fire.toml", BODY + 'kind = "dynamic"\ndensity = 300.0\n'
+    far = body.replace("0.2]", "490.0]").replace("[0.0, 0.0,", "[490.0, 490.0,", 1)
+    open_domain = "[domain]\nmax = [500.0, 500.0, 500.0]\n"
+    path.write_text(with_keys('grid = "window"\n', SOURCE + far + open_domain))
+    with pytest.raises(JobFileError, match=r"cells lie in one window around all sources and dynamic bodies, and need"):
+        load_checked_job(path)
+    path.write_text(with_keys('grid = "window"\nmax = [100.0, 100.0, 100.0]\n', SOURCE + far + open_domain))
+    assert load_checked_job(path)[1].errors == []
+
+
 @pytest.mark.parametrize(("size", "expected"), [(0.12, 0.2), (0.2, 0.2), (0.5, 0.5)])
 def test_a_preview_has_gusts_that_its_cells_can_carry(size, expected, tmp_path):
     path = tmp_path / "fire.toml"
