@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim.shapes.assembly import Assembly
 from sim.shapes.balls import Balls, exact_balls, surface_balls
 from sim.shapes.convex_pieces import convex_pieces
-from sim.shapes.distance_grids import CELLS_PER_WALL, sampled_distances
+from sim.shapes.distance_grids import sampled_distances
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, mass_properties_of_solid
 from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh; half of them in a convex piece of one
 GRID_PADDING = 0.1  # how far a distance grid reaches past its mesh, in longest edges
-PIECE_CELLS = 32  # cells along the longest edge of a piece of a body that breaks, as cloth and smoke meet it
 
 
 class BodyGeometry:
@@ -166,18 +165,12 @@ class BodyGeometry:
 
     @cached_property
     def fine_grid(self) -> LevelSet:
-        """Distances of a mesh as cloth and smoke read them, in the frame of `solid`.
-
-        Of a piece as fine as its whole's walls need; its own edges, however sharp, count as thin walls of others.
-        """
+        """Distances of a mesh as cloth and smoke read them, in the frame of `solid`."""
         if self._piece is None:
             return sampled_distances(self.solid)
-        from sim.shapes.cutting import cut_of
+        from sim.shapes.cutting import wall_and_cell
 
-        longest = float(np.max(self.bounds[1] - self.bounds[0]))
-        return sampled_distances(
-            self.solid, min(longest / PIECE_CELLS, self.solid.scale * cut_of(self._piece).wall / CELLS_PER_WALL)
-        )
+        return sampled_distances(self.solid, wall_and_cell(self._piece, self.solid)[1])
 
 
 def _deformation_of(parameters: WeightedPlacement, placed: PlacedSolid) -> Deformation | None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Voronoi
 
 from sim.shapes.assembly import BODY_PART, Assembly, manifold_of, mesh_of
-from sim.shapes.distance_grids import thin_wall
+from sim.shapes.distance_grids import THIN_SHARE, grid_spacing, thin_wall, wall_thickness
 from sim.shapes.mesh_solid import ConvexSolid, MeshSolid
 from sim.shapes.parameters import CompoundShape, MeshShape, PieceShape, Shape
 from sim.shapes.placement import PlacedSolid, build_rest_shape
@@ -28,6 +28,7 @@ SAME_PLANE = 1.0e-6  # by how much planes of two faces that touch may differ, in
 LEAST_AREA = 1.0e-9  # of a face between two pieces, in squared sizes of the body
 
 MOST_CORNERS = 120  # of the hull of a piece
+PIECE_CELLS = 32  # cells of a grid of distances along the longest edge of a piece, as cloth and smoke meet it
 
 Array = NDArray[np.float64]
 
@@ -52,8 +53,21 @@ class Cut:
 
     @cached_property
     def wall(self) -> float:
-        """How thick the walls of the whole are [m]; see `distance_grids.thin_wall`."""
-        return thin_wall(PlacedSolid(self.whole, 1.0, np.eye(3), np.zeros(3)))
+        """How thick the walls of the whole are [m]; see `distance_grids.wall_thickness`."""
+        return wall_thickness(self.whole, THIN_SHARE)
+
+
+def wall_and_cell(piece: PieceShape | None, solid: PlacedSolid) -> tuple[float, float]:
+    """Thickness of a body's walls, and edge of the cells of the grid by which cloth and smoke meet it [m]; unturned.
+
+    What is cut out of a whole is as thick as that: its own edges, however sharp, count as thin walls of others. The
+    parts of a compound have walls of their own.
+    """
+    if piece is None:
+        wall = thin_wall(solid)
+        return wall, grid_spacing(solid, wall)
+    wall = solid.scale * (wall_thickness(solid.shape, THIN_SHARE) if piece.pieces is None else cut_of(piece).wall)
+    return wall, grid_spacing(solid, min(wall, float(np.ptp(solid.bounds, axis=0).min())), PIECE_CELLS)
 
 
 def build_piece(shape: PieceShape) -> RestShape:

@@ -40,10 +40,13 @@ def thin_wall(solid: PlacedSolid) -> float:
     return solid.scale * wall_thickness(solid.shape, THIN_SHARE)
 
 
-def grid_spacing(solid: PlacedSolid, wall: float) -> float:
-    """Edge of a cell [m] with which walls so thick [m] are felt, or as fine as `MOST_NODES` allow."""
+def grid_spacing(solid: PlacedSolid, wall: float, cells: int | None = None) -> float:
+    """Edge of a cell [m] with which walls so thick [m] are felt, or as fine as `MOST_NODES` allow.
+
+    The longest edge has so many cells at least, `CELLS` if not told.
+    """
     extent = np.ptp(solid.bounds, axis=0)
-    return max(min(float(extent.max()) / CELLS, wall / CELLS_PER_WALL), _finest_spacing(extent))
+    return max(min(float(extent.max()) / (cells or CELLS), wall / CELLS_PER_WALL), _finest_spacing(extent))
 
 
 def _finest_spacing(extent: NDArray[np.float64]) -> float:

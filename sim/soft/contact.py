@@ -233,27 +233,45 @@ def body_at(x: ti.math.vec3, touching: Touching, cell_size: ti.f32) -> ti.i32:
 
 
 @func
-def is_nearest(x: ti.math.vec3, body: ti.i32, touching: Touching) -> bool:
-    """Whether no piece that a body holds to is nearer to a point: together they are one solid."""
-    nearest, distance = True, distance_of(x, body, touching.bodies)
-    for other in range(touching.count):
-        if other != body and touching.leader[other] == touching.leader[body]:
-            there = distance_of(x, other, touching.bodies)
-            nearest &= there > distance or (there == distance and other > body)
-    return nearest
+def distance_together(x: ti.math.vec3, body: ti.i32, touching: Touching) -> ti.f32:
+    """Distance of a point from all that a body leads, negative inside: that from the whole while nothing broke off.
+
+    Then it is the depth in the whole or the distance from what broke off inside, and that from the pieces outside.
+    """
+    (shapes,) = ti.static((touching.bodies.shapes,))
+    y, holds = in_frame(x, body, touching.bodies), touching.holds[body] == 1
+    distance = distance_to(y, ti.select(holds, touching.whole[body], body), shapes)
+    if holds:
+        is_whole, to_pieces = True, 1.0e30
+        for other in range(touching.count):
+            if touching.whole[other] == touching.whole[body]:
+                there = distance_to(y, other, shapes)
+                if touching.leader[other] == body:
+                    to_pieces = ti.min(to_pieces, there)
+                else:
+                    is_whole, distance = False, ti.max(distance, -there)
+        if distance > 0.0 and not is_whole:
+            distance = to_pieces
+    return distance
 
 
 @kernel
 def take_room(blocks: Blocks, stored: ti.i32, nodes: Nodes, touching: Touching):
-    """Take from the room of nodes what bodies fill."""
+    """Take from the room of nodes what bodies fill; those that hold together as one."""
     for n in range(stored * NODES):
         if nodes.mass[n] > 0.0:
             x = place_of_node(n, blocks)
             for b in range(touching.count):
-                if (x - touching.bodies.position[b]).norm() < touching.radius[b] + REACH * blocks.edge:
-                    distance = distance_of(x, b, touching.bodies) / blocks.edge
+                middle, size = touching.bodies.position[b], touching.radius[b]
+                if ti.static(touching.breaks):
+                    middle = touching.middle[b]
+                    size = ti.select(touching.leader[b] == b, touching.size[b], -REACH * blocks.edge)
+                if (x - middle).norm() < size + REACH * blocks.edge:
+                    distance = 0.0
                     if ti.static(touching.breaks):
-                        distance = ti.select(is_nearest(x, b, touching), distance, REACH)
+                        distance = distance_together(x, b, touching) / blocks.edge
+                    else:
+                        distance = distance_of(x, b, touching.bodies) / blocks.edge
                     if distance < REACH:
                         nodes.room[n] = room_left(nodes.room[n], share_before(distance), blocks)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_start import ClothStart
 from pipeline.kinds.checks.joints import joined_to
-from pipeline.kinds.checks.shapes import thin_wall_problem
+from pipeline.kinds.checks.shapes import warn_of_thin_walls
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 from sim.cloth.parameters import PinParameters
@@ -17,7 +17,6 @@ from sim.cloth.start import path_of_pin
 from sim.core.motion import rotation
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
-from sim.shapes.parameters import PieceShape
 from sim.shapes.placement import PlacedSolid
 
 # A body whose shortest side has fewer edges of the cloth may show between its nodes, and pass with less than half.
@@ -37,6 +36,7 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
     find it. Of a group the thinnest body is named.
     """
     thin: dict[str, list[tuple[float, str, ClothStart]]] = {}
+    told: set[str] = set()
     for path, solid in solids.items():
         if path[0] != "rigid":
             continue
@@ -55,9 +55,7 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
         if too_coarse:
             coarsest = max(too_coarse, key=lambda start: start.longest_edge)
             thin.setdefault(body.group, []).append((thickness, body.name, coarsest))
-        met = _met_by_a_grid(body, solid)
-        if met is not None and (problem := thin_wall_problem(met, who="cloth", what="cloth")):
-            findings.warn((*path[:2], "shape"), problem)
+        warn_of_thin_walls(int(path[1]), body, solid, findings, told, who="cloth", what="cloth")
     for bodies in thin.values():
         thickness, name, coarsest = min(bodies, key=lambda each: each[0])
         others = f", and {len(bodies) - 1} more of its group are thin" if len(bodies) > 1 else ""
@@ -67,17 +65,6 @@ def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart
             f"{coarsest.longest_edge:.3g} m each{others}: it may show or pass between the nodes; divide the sheet "
             "more finely, or make the body larger",
         )
-
-
-def _met_by_a_grid(body: RigidBodyParameters, solid: PlacedSolid) -> PlacedSolid | None:
-    """What the walls are of that cloth has to feel: of the first of the pieces of a body the whole, of others none."""
-    from sim.shapes.cutting import cut_of
-
-    if not isinstance(body.shape, PieceShape):
-        return solid
-    if body.shape.number > 1:
-        return None
-    return PlacedSolid(cut_of(body.shape).whole, solid.scale, solid.rotation, solid.position)
 
 
 @dataclass(frozen=True, eq=False)

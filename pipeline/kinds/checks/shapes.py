@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ TRIANGLE_BYTES = 300.0
 
 if TYPE_CHECKING:
     from pipeline.kinds.base import Solids
+    from sim.rigid.parameters import RigidBodyParameters
     from sim.shapes.placement import PlacedSolid
 
 
@@ -112,15 +114,33 @@ def file_exists(name: str, kind: str, key: KeyPath, findings: Findings) -> bool:
     return False
 
 
-def thin_wall_problem(solid: PlacedSolid, *, who: str, what: str) -> str | None:
+def warn_of_thin_walls(
+    number: int,
+    body: RigidBodyParameters,
+    solid: PlacedSolid,
+    findings: Findings,
+    told: set[str],
+    *,
+    who: str,
+    what: str,
+) -> None:
+    """Note a body, or the first of the pieces of one, whose walls are too thin for a grid; `told` are their names."""
+    name = body.whole or body.name
+    if name not in told and (problem := thin_wall_problem(body, solid, who=who, what=what)):
+        told.add(name)
+        findings.warn(("rigid", number, "shape"), problem)
+
+
+def thin_wall_problem(body: RigidBodyParameters, solid: PlacedSolid, *, who: str, what: str) -> str | None:
     """Reason why walls of a body are too thin for the finest grid of its distances; None if they are not.
 
     `who` meets it by that grid, and `what` may pass through the walls then; primitives need no grid.
     """
-    from sim.shapes.distance_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
+    from sim.shapes.cutting import wall_and_cell
+    from sim.shapes.distance_grids import CELLS_PER_WALL, THIN_SHARE
 
-    wall = thin_wall(solid)
-    cell = grid_spacing(solid, wall)
+    unturned = replace(solid, rotation=np.eye(3), position=np.zeros(3))
+    wall, cell = wall_and_cell(body.shape if isinstance(body.shape, PieceShape) else None, unturned)
     if wall >= CELLS_PER_WALL * cell:
         return None
     return (

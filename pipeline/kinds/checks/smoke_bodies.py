@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from pipeline.kinds.base import Solids
-from pipeline.kinds.checks.shapes import thin_wall_problem
+from pipeline.kinds.checks.shapes import warn_of_thin_walls
 from pipeline.model.amounts import rounded_down
 from pipeline.model.boxes import smoke_box, touch
 from pipeline.model.job import Job
@@ -100,12 +100,11 @@ def check_mesh_grids(
     job: Job, smoke: SmokeParameters, solids: Solids, geometry_of: GeometryBuilder, findings: Findings
 ) -> None:
     """Note meshes that can come into a smoke's box, and whose walls are too thin for the finest grid of distances."""
+    told: set[str] = set()
     for number in _moving(job, solids):
-        body, geometry = job.rigid[number], geometry_of(number)
+        body, solid, geometry = job.rigid[number], solids["rigid", number], geometry_of(number)
         if geometry is not None and can_come(body, geometry, smoke, job.domain):
-            problem = thin_wall_problem(solids["rigid", number], who=f'smoke "{smoke.name}"', what="air")
-            if problem is not None:
-                findings.warn(("rigid", number, "shape"), problem)
+            warn_of_thin_walls(number, body, solid, findings, told, who=f'smoke "{smoke.name}"', what="air")
 
 
 def _moving(job: Job, solids: Solids) -> list[int]:

@@ -326,3 +326,20 @@ def test_shells_with_thinner_walls_than_cloth_can_feel_are_told(wall, is_told, t
     body = BALL.replace('"sphere", radius = 0.1', '"mesh", file = "shell.ply"').replace("0.3]", "0.25]")
     told = [line for line in warnings(SHEET + body, tmp_path) if "m or thinner; the finest grid that" in line]
     assert len(told) == is_told
+
+
+@pytest.mark.parametrize("met_by", [SHEET, 'name = "air"' + PLUME], ids=["cloth", "smoke"])
+@pytest.mark.parametrize(("wall", "pieces", "is_told"), [(0.001, 3, True), (0.002, 16, False)])
+def test_a_vase_that_breaks_is_told_once_where_the_grids_of_its_pieces_miss_its_walls(
+    met_by, wall, pieces, is_told, tmp_path
+):
+    """A grid of the whole misses both walls, by cells of 1.6 mm; pieces are smaller, and have finer ones."""
+    profile = [[0, 0], [0.2, 0], [0.2, 0.4], [0.2 - wall, 0.4], [0.2 - wall, wall], [0, wall]]
+    vase = '[[rigid]]\nname = "vase"\nkind = "dynamic"\ndensity = 2500.0\nposition = [0, 0, 0.22]\n'
+    vase += f'shape = {{ type = "revolved", profile = {profile} }}\nbreaks = {{ strength = 1e7, pieces = {pieces} }}\n'
+    told = [
+        line
+        for line in checked(met_by + vase, tmp_path / "vase.toml").warnings
+        if "m or thinner; the finest grid that" in line
+    ]
+    assert len(told) == is_told
