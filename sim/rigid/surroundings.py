@@ -71,8 +71,8 @@ class Surroundings:
         self._centre = np.array([centre for _, centre in displaced])
         # Accelerations [m/s²], [1/s²] by the pressure, raw and as far as joints let bodies yield, (n, 6) each.
         self._held, self._yielding = np.zeros((n, 6)), np.zeros((n, 6))
-        self._felt = np.zeros(n)  # size of the pressure's acceleration, of those asleep as well [m/s²]
         self._given = np.zeros((n, 6))  # of the latter since the air was last looked at [m/s], [1/s]
+        self._felt = np.zeros(n)  # size of the pressure's acceleration, of those asleep as well [m/s²]
 
     def where(self) -> NDArray[np.int64]:
         """Number of the box that each body is in, pieces that hold together as one, or `NOWHERE`, (n,)."""
