@@ -142,6 +142,7 @@ class RigidContact(DeviceShapes):
         )
         self.set_friction(np.asarray(friction, dtype=np.float64))
         self._motion: BodyMotion | None = None
+        self._leaders: NDArray[np.int64] | None = None  # of what moves as one, once some do
         self._time_s = 0.0
         self._advance = LARGEST_ADVANCE * 0.5 * np.array([geometry.shortest_edge for geometry in geometries])
         self._advance_on_device = on_device(self._advance)
@@ -229,16 +230,16 @@ class RigidContact(DeviceShapes):
 
     def _glue(self, leader: NDArray[np.int64], arm: Array) -> Array:
         """Say which bodies move as one, as of `BodyMotion`; returns the lengths of all arms [m], (b,)."""
-        m, leaders, following = len(leader), np.arange(self.count), np.full(self.count, -1)
-        leaders[:m] = leader
-        in_turn = np.argsort(leaders, kind="stable")
-        alike = leaders[in_turn[1:]] == leaders[in_turn[:-1]]
-        following[in_turn[:-1][alike]] = in_turn[1:][alike]
-        arms = np.zeros((self.count, 3))
-        arms[:m] = arm
-        self.pushed = self.pushed._replace(glued=True)
-        for array, values in ((self.pushed.leader, leaders), (self.pushed.next, following), (self.pushed.arm, arms)):
-            put(array, values)
+        m, leaders, arms = len(leader), np.arange(self.count), np.zeros((self.count, 3))
+        leaders[:m], arms[:m] = leader, arm
+        if self._leaders is None or (leaders != self._leaders).any():
+            following, in_turn = np.full(self.count, -1), np.argsort(leaders, kind="stable")
+            alike = leaders[in_turn[1:]] == leaders[in_turn[:-1]]
+            following[in_turn[:-1][alike]] = in_turn[1:][alike]
+            put(self.pushed.leader, leaders)
+            put(self.pushed.next, following)
+            self.pushed, self._leaders = self.pushed._replace(glued=True), leaders
+        put(self.pushed.arm, arms)
         lengths: Array = np.linalg.norm(arms, axis=1)
         return lengths
 
