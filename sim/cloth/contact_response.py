@@ -352,7 +352,10 @@ def settle_all(count: ti.i32, whole_end: ti.i32, r: Response):
         given_body, given = -1, Given(0)
         for c in range(first, first + ti.static(1 if runs_on_gpu() else AT_A_TIME)):
             body, more = -1, Given(0)
-            if c < count and impulses.mobility[c] > 0.0 and is_settled(c, r):
+            settles = False
+            if c < count:  # what functions read is read whatever stands before an `and`
+                settles = impulses.mobility[c] > 0.0 and is_settled(c, r)
+            if settles:
                 push = settle(c, r)
                 body = contacts.kind[c]
                 if body >= 0:

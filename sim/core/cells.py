@@ -202,7 +202,8 @@ def settle_in_cells(count: ti.i32, cell_count: ti.i32, ids: Integers, by_id: ti.
         for k in range(first + 1, arrays.cell_start[cell + 1]):
             point = arrays.order[k]
             slot = k
-            while slot > first and is_behind(arrays.order[slot - 1], point, ids, by_id):
+            # What a function reads is read whatever stands before the `and`.
+            while slot > first and is_behind(arrays.order[ti.max(slot - 1, first)], point, ids, by_id):
                 arrays.order[slot] = arrays.order[slot - 1]
                 slot -= 1
             arrays.order[slot] = point
