@@ -61,7 +61,7 @@ class Spring:
     """Counts the exchanges, to show that coupled solvers share their substeps."""
 
     def __init__(self, *bodies: str, is_loose: bool = False) -> None:
-        self.bodies, self.is_loose = bodies, is_loose
+        self.bodies, self.is_loose, self.pushes_first = bodies, is_loose, False
         self.exchanged: list[float] = []
         self.followed: list[float] = []
 
