@@ -344,7 +344,7 @@ def _couple_smokes(
             coupling.exchange(0.0)
         smoke.move_obstacles()
         if smoke.free_bodies is not None:
-            smoke.give_way()
+            smoke.give_way(smoke.free_bodies)
         follows = any(source.follow is not None for source in smoke.parameters.source)
         in_the_way += [SmokeSourcesOnBodies(rigid, smoke)] if rigid is not None and follows else []
         couplings += [*in_the_way, *(SmokeClothCoupling(cloth, smoke, number=number) for cloth in cloths)]

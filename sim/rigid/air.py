@@ -80,7 +80,7 @@ class OuterForces:
         self._covers = _covers_of(planes, self._samples, solids) if glue is not None and forces.blows else None
 
     def push(self, bodies: MovingBodies, gravity: Float64Array, dt: float, is_surrounded: NDArray[np.bool_]) -> None:
-        """Let them act on dynamic bodies for dt [s]; no wind does on those that other air surrounds, (n,)."""
+        """Let them act on dynamic bodies for dt [s]; no wind acts on those that other air surrounds, (n,)."""
         n, glue = len(bodies), self._glue
         leader, movers = (np.arange(n), bodies) if glue is None else (glue.leader, glue.movers)
         given, pressed, slowing, lost = np.zeros((n, 3)), np.zeros((n, 6)), np.zeros((n, 2)), np.zeros(n)

@@ -27,7 +27,7 @@ from sim.rigid.supports import Supports, friction_pyramid, least_shares
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.cutting import cut_of
 from sim.shapes.parameters import PieceShape
-from sim.shapes.placement import PlacedSolid, build_rest_shape
+from sim.shapes.placement import PlacedSolid
 
 POISSON_RATIO = 0.2
 """Of brittle solids [-], about; Young's modulus does not change how loads are shared."""
@@ -63,7 +63,7 @@ class Whole(NamedTuple):
 
     def solid(self) -> PlacedSolid:
         """What it is in one piece, in the axes of its pieces, about its own origin."""
-        return PlacedSolid(build_rest_shape(self.shape.of), self.scale, np.eye(3), np.zeros(3))
+        return PlacedSolid(cut_of(self.shape).whole, self.scale, np.eye(3), np.zeros(3))
 
 
 class _Component(NamedTuple):

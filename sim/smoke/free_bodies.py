@@ -169,29 +169,33 @@ def flux_of_answer(box: Grid, solids: Solids, carried: Carried, i: ti.i32, j: ti
         for axis, side in ti.static(ti.ndrange(3, 2)):
             share = _share(axis, side, box, solids, at)
             if share != 0.0:
-                first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
                 for a, b in ti.static(ti.ndrange(2, 2)):
-                    shift = _shift(axis, side, first, a, second, b)
-                    body = solids.owner[at + shift.dot(steps(box))]
+                    corner = _corner(axis, side, a, b)
+                    body = solids.owner[at + corner.dot(steps(box))]
                     if body != NOBODY:
-                        arm = ti.cast(ti.Vector([i, j, k]) + shift, ti.f32) - carried.centre[body]
-                        flux += share * (carried.change[body] + carried.turn[body].cross(arm))[axis]
+                        flux += share * _change_at(ti.Vector([i, j, k]) + corner, body, carried)[axis]
     return flux
 
 
 @func
-def _shift(
-    axis: ti.template(),
-    side: ti.template(),
-    first: ti.template(),
-    a: ti.template(),
-    second: ti.template(),
-    b: ti.template(),
-):
+def _corner(axis: ti.template(), side: ti.template(), a: ti.template(), b: ti.template()):
     """From the lowest corner of a cell to one of a face of it."""
-    shift = ti.Vector([0, 0, 0])
-    shift[axis], shift[first], shift[second] = side, a, b
-    return shift
+    first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
+    corner = ti.Vector([0, 0, 0])
+    corner[axis], corner[first], corner[second] = side, a, b
+    return corner
+
+
+@func
+def _arm(corner, body: ti.i32, carried: Carried) -> ti.math.vec3:
+    """From the centre of a body to a corner [cells]."""
+    return ti.cast(corner, ti.f32) - carried.centre[body]
+
+
+@func
+def _change_at(corner, body: ti.i32, carried: Carried) -> ti.math.vec3:
+    """How the velocity of a body changes at a corner [m/s]."""
+    return carried.change[body] + carried.turn[body].cross(_arm(corner, body, carried))
 
 
 @kernel
@@ -206,15 +210,13 @@ def _answer(box: Grid, solids: Solids, carried: Carried, values: Floats):
                 for axis, side in ti.static(ti.ndrange(3, 2)):
                     share = values[at] * _share(axis, side, box, solids, at)
                     if share != 0.0:
-                        first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
                         for a, b in ti.static(ti.ndrange(2, 2)):
-                            shift = _shift(axis, side, first, a, second, b)
-                            if solids.owner[at + shift.dot(steps(box))] == body:
+                            corner = _corner(axis, side, a, b)
+                            if solids.owner[at + corner.dot(steps(box))] == body:
                                 force = ti.math.vec3(0.0)
                                 force[axis] = share
-                                arm = ti.cast(ti.Vector([i, j, k]) + shift, ti.f32) - carried.centre[body]
                                 push += force
-                                twist += arm.cross(force)
+                                twist += _arm(ti.Vector([i, j, k]) + corner, body, carried).cross(force)
         carried.push_of_row[row], carried.twist_of_row[row] = push, twist
     for body in range(bodies):
         push, twist = ti.math.vec3(0.0), ti.math.vec3(0.0)
@@ -234,8 +236,7 @@ def _change_corners(box: Grid, solids: Solids, carried: Carried):
             at = row_start(box, i, j) + k
             body = solids.owner[at]
             if body != NOBODY:
-                arm = ti.cast(ti.Vector([i, j, k]), ti.f32) - carried.centre[body]
-                change = carried.change[body] + carried.turn[body].cross(arm)
+                change = _change_at(ti.Vector([i, j, k]), body, carried)
                 solids.velocity.x[at] += change[0]
                 solids.velocity.y[at] += change[1]
                 solids.velocity.z[at] += change[2]

@@ -36,7 +36,7 @@ from sim.smoke.sides import blow_in, brake_inflow, start_wind
 from sim.smoke.sources import require_cells, sources_of
 from sim.smoke.transport import Transport
 from sim.smoke.turbulence import Turbulence
-from sim.smoke.window import Fitting, carry_over
+from sim.smoke.window import Ends, Fitting, carry_over
 
 RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed of sound [m/s]
 
@@ -254,7 +254,7 @@ class SmokeSolver:
         if self.obstacles.commit():
             self._follow_obstacles()
 
-    def give_way(self) -> None:
+    def give_way(self, bodies: FreeBodies) -> None:
         """Let air at rest flow as obstacles move now, and bodies keep their velocities: others have set them going.
 
         A window is fitted to the bodies, and then to the flow around them.
@@ -264,8 +264,7 @@ class SmokeSolver:
             for mover in self.obstacles.movers:
                 mover.exchange(0.0)
             self.move_obstacles()  # once more: faces are open as between two commits
-            if self.free_bodies is not None:
-                self.free_bodies.hold()
+            bodies.hold()
             self._projection.project()
             self._extrapolation.fill()
 
@@ -281,8 +280,11 @@ class SmokeSolver:
         """Compute, from now on, in a window that fits the coming frame."""
         if self._fitting.follows:
             frame = self.time_s, self.time_s + self._frame_s
-            there = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
-            there += [box for mover in self.obstacles.movers for box in mover.reach(self._frame_s)]
+            emitting = [source.bounds(*frame) for source in self.sources if source.parameters.emits_during(*frame)]
+
+            def there(frames: float) -> list[Ends]:
+                return emitting + [box for each in self.obstacles.movers for box in each.reach(frames * self._frame_s)]
+
             fuel = None if self._combustion is None else self._combustion.fuel
             given = self.grid.window, self._outside.velocity, there, self._rows
             self._move_window(self._fitting.next(self.air, fuel, *given))

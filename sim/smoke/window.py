@@ -13,7 +13,7 @@ ahead, so that a front that moves does not ask for one in each.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import taichi as ti
@@ -70,17 +70,23 @@ class Fitting:
         return None if ends is None or not self.follows else self._fitted(ends)
 
     def next(
-        self, air: Air, fuel: ti.Ndarray | None, window: Window, wind: Vector3, there: Iterable[Ends], rows: Rows
+        self,
+        air: Air,
+        fuel: ti.Ndarray | None,
+        window: Window,
+        wind: Vector3,
+        there: Callable[[float], Iterable[Ends]],
+        rows: Rows,
     ) -> Window:
         """The window of the coming frame: the present one, unless that is too small or much too large.
 
-        Air outside has the velocity of a wind [m/s]. What is there are sources that emit in the frame, and bodies, each
-        between the corners of where it is [m]. Where neither they nor anything else is left, the middle of the window
-        stays.
+        Air outside has the velocity of a wind [m/s]. What is there within so many frames are sources that emit in the
+        coming one, and bodies, each between the corners of where it is [m]. Where neither they nor anything else is
+        left, the middle of the window stays.
         """
-        given = self._in_cells(there)
         soon, later = (
-            _union(given, self._busy(air, fuel, window, wind, frames, rows)) for frames in (1.0, FRAMES_AHEAD)
+            _union(self._in_cells(there(frames)), self._busy(air, fuel, window, wind, frames, rows))
+            for frames in (1.0, FRAMES_AHEAD)
         )
         low, high = np.asarray(window.first), np.asarray(window.first) + window.cells
         nothing = np.stack([0.5 * (low + high)] * 2)

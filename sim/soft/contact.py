@@ -48,7 +48,7 @@ UPPER = np.triu_indices(6)
 UPPER_PLACE = {(int(row), int(column)): place for place, (row, column) in enumerate(zip(*UPPER, strict=True))}
 STICKS = 1.0e30  # friction against a body that soft matter never leaves, nor slides on [-]
 SLOW = 1.0e-12  # speed along a surface at which there is no direction of it [m/s]
-SEAM = 2.0  # how much larger pieces are inside of their whole, in steps of differences
+SEAM = 2.0  # how much larger pieces are inside of their whole, in half widths of central differences
 
 
 @bundle
