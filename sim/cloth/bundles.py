@@ -90,7 +90,7 @@ class CellArrays(NamedTuple):
     across: Floats  # c_a of d_v [1/m], (arity s,)
     law: Weights  # area times C and G [J], nu [-], damping over stiffness [s], (s,)
     multiplier: Floats  # of the shear, (s,); rectangles only
-    followed: Strains  # shear where the last step started [-], and its smoothed rate [1/s], (s,)
+    followed: Strains  # shear where the last step started [-], and its smoothed rate [1/s], (s,); triangles: (3 s,)
     mesh: MeshNodes  # those of triangles; none of rectangles
 
 

@@ -211,8 +211,9 @@ class DeviceCells:
         self.is_damped = False
         self.colours, (self.bounds,) = colour_groups(cells.colour)
         law = ti.Vector.ndarray(4, ti.f32, self.count)
-        multiplier = ti.ndarray(ti.f32, self.count if cells.arity == RECTANGLE else 1)
-        followed = ti.Vector.ndarray(2, ti.f32, self.count)
+        is_mesh = cells.arity == TRIANGLE
+        multiplier = ti.ndarray(ti.f32, 1 if is_mesh else self.count)
+        followed = ti.Vector.ndarray(2, ti.f32, FOLLOWED_STRAINS * self.count if is_mesh else self.count)
         listed = (on_device(each.ravel()) for each in (cells.nodes, cells.along, cells.across))
         self.on_device = CellArrays(self.count, *listed, law, multiplier, followed, _mesh_nodes(cells))
 
@@ -313,18 +314,20 @@ def shear_of(d_u: ti.math.vec3, d_v: ti.math.vec3):
 
 
 FOLLOWED = 0.6
-"""Part of a change of shear that its smoothed rate takes over in a step."""
+"""Part of a change of a rectangle's shear that its smoothed rate takes over in a step."""
+
+FOLLOWED_STRAINS = 3  # of a triangle: e_u, e_v and shear
 
 
 @ti.func
-def smoothed(rate, change):
-    """Smoothed rate of a cell's shear, after a change [1/s].
+def smoothed(rate, change, followed):
+    """Smoothed rate of a cell's strain [1/s], which takes over the part `followed` of a change.
 
-    Cells pull by the shear at the end of a step less what its smoothed rate makes of it meanwhile. Implicit Euler alone
-    brakes shear waves as a damping of as much time as a step has; so those of forty steps per period keep 0.9997 of
-    their amplitude in a step instead of 0.988, and those that steps cannot follow still fall, to 0.77 in the limit.
+    Cells pull by the strain at the end of a step less what its smoothed rate makes of it meanwhile. Implicit Euler
+    alone brakes waves as a damping of as much time as a step has; with 0.6 those of forty steps per period keep 0.9997
+    of their amplitude in a step instead of 0.988, and those that steps cannot follow still fall, to 0.77 in the limit.
     """
-    return rate + FOLLOWED * (change - rate)
+    return rate + followed * (change - rate)
 
 
 @ti.func
@@ -406,7 +409,7 @@ def solve_shear(
         weight = weight_along(by_u, by_v, column(w, at))
         stiffness = strength[at] * weight
         start_shear, _, _ = shear_of(column(start_u, at), column(start_v, at))
-        rate[at] = ti.select(is_first, smoothed(rate[at], rate_before * (start_shear - start[at])), rate[at])
+        rate[at] = ti.select(is_first, smoothed(rate[at], rate_before * (start_shear - start[at]), FOLLOWED), rate[at])
         start[at] = ti.select(is_first, start_shear, start[at])
         missing = strength[at] * (shear - resolved(coarsening * stiffness) * ahead * rate[at]) + before[at]
         change = -over_relaxed(stiffness) * missing / (stiffness + 1.0)

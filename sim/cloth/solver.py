@@ -354,12 +354,12 @@ class ClothSolver:
         return slice(int(first), int(last))
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """Where nodes are and how they and shears move; the time, how many sweeps steps take, how they are divided and
+        """Where nodes are and how they and strains move; the time, how many sweeps steps take, how they are divided and
         why, and how long the last one was.
         """
         state = self.state
         arrays = {name: getattr(state, name).to_numpy() for name in _STATE}
-        arrays |= {f"shear_{k}": cells.on_device.followed.to_numpy() for k, cells in enumerate(self._cells)}
+        arrays |= {f"strain_{k}": cells.on_device.followed.to_numpy() for k, cells in enumerate(self._cells)}
         clock = self._time_s, self._sweeps, self._refinement, self._excess, self._integrator.last_dt
         return {**arrays, "clock": np.array(clock)}
 
@@ -370,7 +370,7 @@ class ClothSolver:
             ValueError: an array is missing or has another shape.
         """
         expected = {**dict.fromkeys(_STATE, (self.state.vertex_count, 3)), "clock": (5,)}
-        expected |= {f"shear_{k}": (cells.count, 2) for k, cells in enumerate(self._cells)}
+        expected |= {f"strain_{k}": (*cells.on_device.followed.shape, 2) for k, cells in enumerate(self._cells)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
@@ -378,7 +378,7 @@ class ClothSolver:
         for name, kind in _STATE.items():
             getattr(self.state, name).from_numpy(np.ascontiguousarray(arrays[name], dtype=kind))
         for k, cells in enumerate(self._cells):
-            cells.on_device.followed.from_numpy(np.ascontiguousarray(arrays[f"shear_{k}"], dtype=np.float32))
+            cells.on_device.followed.from_numpy(np.ascontiguousarray(arrays[f"strain_{k}"], dtype=np.float32))
         self.state.place_displaced()
         self._time_s, sweeps, refinement, self._excess, self._integrator.last_dt = arrays["clock"].tolist()
         self._sweeps, self._refinement = int(sweeps), int(refinement)

@@ -4,6 +4,7 @@ import taichi as ti
 
 from sim.cloth.bundles import CellArrays, Nodes, Strains, TriangleFrames, TriangleSystem, TriangleWork
 from sim.cloth.device_springs import (
+    FOLLOWED_STRAINS,
     TINY_LENGTH,
     DeviceCells,
     change_of,
@@ -28,6 +29,9 @@ MOST_ITERATIONS = 200  # more are only asked for by steps in which a wave crosse
 
 TOLERANCE = 0.03
 """Of the displacement by triangles in a step, in the norm of energy: that `ITERATIONS_AT_ONCE` at last still change."""
+
+FOLLOWED = 0.85
+"""Part of a change of strain that its smoothed rate takes over: waves that steps cannot follow fall by 0.92 a step."""
 
 LEAST_ACCELERATION = 1.0  # by triangles, of which `TOLERANCE` is at least [m/s²]: 0.3 % of the weight
 
@@ -211,18 +215,23 @@ def linearize(system: TriangleSystem, nodes: Nodes, dt: ti.f32, rate_before: ti.
         frames.n_u[s], frames.n_v[s], frames.by_u[s], frames.by_v[s] = n_u, n_v, by_u, by_v
         moved_u, moved_v = d_u - start_u, d_v - start_v
         e = ti.math.vec2(length_u - 1.0, length_v - 1.0)
-        mesh.strain[s] = e + rate * ti.math.vec2(n_u.dot(moved_u), n_v.dot(moved_v))
-        start_shear = shear_of(start_u, start_v)[0]
-        if is_first == 1:
-            change = rate_before * (start_shear - cells.followed[s][0])
-            cells.followed[s] = ti.math.vec2(start_shear, smoothed(cells.followed[s][1], change))
-        shear = shear_of(d_u, d_v)[0] + rate * (by_u.dot(moved_u) + by_v.dot(moved_v)) - ahead * cells.followed[s][1]
+        length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
+        start = ti.math.vec3(length_u - 1.0, length_v - 1.0, shear_of(start_u, start_v)[0])
+        rates = ti.math.vec3(0.0)
+        for a in ti.static(range(FOLLOWED_STRAINS)):
+            at = FOLLOWED_STRAINS * s + a
+            if is_first == 1:
+                change = rate_before * (start[a] - cells.followed[at][0])
+                cells.followed[at] = ti.math.vec2(start[a], smoothed(cells.followed[at][1], change, FOLLOWED))
+            rates[a] = ahead * cells.followed[at][1]
+        damped = rate * ti.math.vec3(n_u.dot(moved_u), n_v.dot(moved_v), by_u.dot(moved_u) + by_v.dot(moved_v))
+        mesh.strain[s] = e + damped.xy - rates.xy
+        shear = shear_of(d_u, d_v)[0] + damped.z - rates.z
         shear *= cells.law[s][1]
         frames.s_u[s], frames.s_v[s] = shear * by_u, shear * by_v
-        length_u, length_v = ti.max(start_u.norm(), TINY_LENGTH), ti.max(start_v.norm(), TINY_LENGTH)
-        frames.start[s] = ti.math.vec2(length_u - 1.0, length_v - 1.0)
+        frames.start[s] = start.xy
         lengths = ti.math.vec4(length_u, length_v, start_more.norm(), start_less.norm())
-        pull = ROOT_HALF * cells.law[s][1] * start_shear
+        pull = ROOT_HALF * cells.law[s][1] * start.z
         frames.turning[s] = STRAIGHTENED / ti.max(lengths, TINY_LENGTH) * ti.math.vec4(1.0, 1.0, pull, -pull)
     for k in range(system.cells.mesh.count):
         mesh.mean[mesh.node[k]] = mean_strain(k, mesh, mesh.strain)
