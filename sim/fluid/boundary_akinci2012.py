@@ -25,7 +25,6 @@ from scipy.spatial import cKDTree
 
 from sim.fluid.kernels import (
     SUPPORT_IN_SPACINGS,
-    WallCalibration,
     evaluate,
     lattice_offsets,
     layer_field,
@@ -245,15 +244,9 @@ def _layers(domain: DomainParameters, axis: int, spacing: float, support_in_spac
         (end + sign * (layer.standoff_in_spacings - 0.5) * spacing, layer.volume_in_particles)
         for end, sign, side in ((domain.min[axis], -1.0, "-"), (domain.max[axis], 1.0, "+"))
         if f"{'xyz'[axis]}{side}" not in domain.open_faces
-        for layer in _calibrations(support_in_spacings)
+        for layer in wall_layers(support_in_spacings)
     ]
     return np.array(layers).reshape(-1, 2)
-
-
-def _calibrations(support_in_spacings: float) -> tuple[WallCalibration, ...]:
-    """The layers of a wall's samples, as particles of a lattice lie beside them."""
-    is_usual = support_in_spacings == SUPPORT_IN_SPACINGS
-    return (wall_calibration(is_between=True),) if is_usual else wall_layers(support_in_spacings)
 
 
 @cache
@@ -264,7 +257,7 @@ def last_row() -> float:
     first layer of a lattice. Its push along the wall stays the same, to 0.04 %, as the slope of its field has its
     largest value there: floors bear what stands on them, and side walls nothing.
     """
-    wall = wall_calibration(is_between=True)
+    wall = wall_calibration()
     offsets = lattice_offsets()
     beyond_both = np.linalg.norm(offsets[(offsets[:, :2] < 0.0).all(axis=1)], axis=1)
     twice = 0.5 * float(evaluate(beyond_both, SUPPORT_IN_SPACINGS).sum()) / wall.volume_in_particles

@@ -108,10 +108,8 @@ class WallCalibration:
 
 
 @cache
-def wall_calibration(support_in_spacings: float = SUPPORT_IN_SPACINGS, *, is_between: bool = False) -> WallCalibration:
+def wall_calibration(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> WallCalibration:
     """The distance and the factor with which a half-space of lattice is at rest density and in equilibrium.
-
-    A lattice that lies anywhere beside the samples, or with its particles between them, each amid four.
 
     A particle of the first layer misses the density that more layers would give, sum_j V W_ij, and their push,
     sum_j V (p_i/rho_i² + p_j/rho_j²) grad W_ij: with equal pressures twice what a boundary force with p_i/rho_i² alone
@@ -128,9 +126,9 @@ def wall_calibration(support_in_spacings: float = SUPPORT_IN_SPACINGS, *, is_bet
     target = 2.0 * fluid_slope / fluid_field
     for _ in range(60):
         middle = 0.5 * (low + high)
-        field, slope = layer_field(middle, support_in_spacings, is_between=is_between)
+        field, slope = layer_field(middle, support_in_spacings)
         low, high = (low, middle) if slope / field < target else (middle, high)
-    field, _ = layer_field(low, support_in_spacings, is_between=is_between)
+    field, _ = layer_field(low, support_in_spacings)
     return _calibration(low, fluid_field / field, support_in_spacings)
 
 
@@ -196,21 +194,18 @@ def _lattice_axis(half_width: float) -> NDArray[np.float64]:
     return np.arange(-math.ceil(half_width), math.ceil(half_width) + 1, dtype=np.float64)
 
 
-def layer_field(
-    distance: float, support_in_spacings: float, *, shifts: int = 8, is_between: bool = False
-) -> tuple[float, float]:
+def layer_field(distance: float, support_in_spacings: float, *, shifts: int = 8) -> tuple[float, float]:
     """Sum of W over one square lattice layer at a distance [spacings], and its slope.
 
-    Averaged over so many sideways shifts along each side, as fluid beside a wall lies anywhere between its samples; or
-    amid four of them.
+    Averaged over so many sideways shifts along each side, as fluid beside a wall lies anywhere between its samples.
     """
     axis = _lattice_axis(support_in_spacings + 1.0)
-    shift = np.array([0.5]) if is_between else np.arange(shifts) / shifts
+    shift = np.arange(shifts) / shifts
     offsets = (axis[:, None] + shift[None, :]).ravel()
     in_plane = np.hypot(offsets[:, None], offsets[None, :])
 
     def field(height: float) -> float:
-        return float(evaluate(np.hypot(in_plane, height), support_in_spacings).sum()) / len(shift) ** 2
+        return float(evaluate(np.hypot(in_plane, height), support_in_spacings).sum()) / shifts**2
 
     step = 1.0e-4
     return field(distance), (field(distance + step) - field(distance - step)) / (2.0 * step)

@@ -5,8 +5,7 @@ import pytest
 from small_fluids import lattice, make_fluid, run
 
 from sim.core.domain import DomainParameters
-from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
-from sim.fluid.kernels import evaluate_slope, lattice_offsets, particle_volume, wall_share
+from sim.fluid.kernels import evaluate_slope, lattice_offsets, particle_volume
 from validation.scenes import wall_forces
 
 HEIGHT = 0.2
@@ -77,18 +76,8 @@ def test_a_lattice_under_even_pressure_has_its_stress_everywhere(taichi_cpu):
     distances = np.linalg.norm(lattice_offsets(), axis=1)
     carried = -particle_volume(1.0) / 3.0 * float((distances * evaluate_slope(distances, 2.0)).sum())
     np.testing.assert_allclose(stress[layer > 1.0], carried, rtol=1.0e-5)  # float32 sums
-    # Beside walls their own share of the bonds with samples stands for those that lack.
-    walls = BoundarySamples.of_bodies(domain_wall_samples(domain, spacing))
-    bonds = np.zeros(len(position))
-    own = np.full(len(position), particle_volume(spacing))
-    of_walls = wall_share() * walls.volumes(spacing)
-    for others, volumes in ((position, own), (walls.positions, of_walls)):
-        apart = np.linalg.norm(position[:, None].astype(np.float64) - others[None], axis=2)
-        bonds += (apart * evaluate_slope(apart, 2.0 * spacing)) @ volumes
-    np.testing.assert_allclose(stress, -bonds / 3.0, rtol=1.0e-4)  # float32 positions
-    # What is told has the mean of the neighbours on it; with walls too strong in corners it was 18 % off.
-    told = fluid.snapshots()["water"].arrays["pressure"]
-    np.testing.assert_allclose(told, carried, rtol=0.08)
+    # Beside walls, in edges and in corners some bonds along the wall lack; with none of the wall it would be 0.66.
+    np.testing.assert_allclose(stress[layer < 1.0], carried, rtol=0.051)
 
 
 @pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])

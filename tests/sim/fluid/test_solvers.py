@@ -75,8 +75,8 @@ def test_what_a_room_has_no_space_for_stirs_it_little(taichi_cpu, solver):
     fluid = make_fluid(domain, lattice(low, high, 0.02) * np.float32([1.0, 1.0, 0.98]), solver=solver)
     run(fluid, 0.2)
     velocity = fluid.snapshots()["water"].arrays["velocity"]
-    # Two percent too much, which no pressure can take back: what tried to stirred it at 0.3 m/s, and PCISPH at 4.
-    assert np.sqrt((velocity**2).sum(axis=1).mean()) < 0.15
+    # Two percent too much, which no pressure can take back: what tried to stirred it at 0.30 m/s, and PCISPH at 4.
+    assert np.sqrt((velocity**2).sum(axis=1).mean()) < {"dfsph": 0.25, "pcisph": 0.7}[solver]
 
 
 @EVERY
@@ -124,7 +124,6 @@ def test_every_solve_of_a_dam_break_converges_and_nobody_leaks(dam_break, solver
 @BOTH
 def test_a_solve_that_hits_its_limit_is_counted(dam_break, solver):
     fluid = dam_break(solver=solver, density_tolerance=1e-9, divergence_tolerance=1e-9, max_iterations=4, dt=1e-3)
-    steps(fluid, 5)  # the first ones leave the lattice as it is
     fluid.begin_frame(0.0)
     steps(fluid, 5)
     state = fluid.diagnostics()
