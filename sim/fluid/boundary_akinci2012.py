@@ -114,7 +114,7 @@ class BoundarySamples:
 def domain_wall_samples(
     domain: DomainParameters, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS
 ) -> BoundarySamples:
-    """Samples of the domain's closed faces, 0.94 spacings outside of each, or in two layers at a wide support.
+    """Samples of the domain's closed faces, 0.95 spacings outside of each, or in two layers at a wide support.
 
     They are the products of lines along the axes, and weigh the products of what their coordinates do. At the usual
     support each wall ends at its own edges, and its samples lie between the particles of a lattice that fills the

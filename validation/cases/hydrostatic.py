@@ -31,7 +31,7 @@ def stand(solver: str, layers: int) -> dict[str, Any]:
         times.append(time)
         speeds.append(float(np.sqrt((velocity**2).sum(axis=1).mean())))
         samples, pushes = wall_forces(fluid)
-        of_floor = samples[:, 2] < -0.5 * spacing  # which lie 0.94 spacings deep; other walls end 0.05 beneath
+        of_floor = samples[:, 2] < -0.5 * spacing  # which lie 0.95 spacings deep; other walls end 0.05 beneath
         forces.append(-float(pushes[of_floor, 2].sum()) / weight)
         if time > SETTLED:
             heights.append(position[:, 2])
