@@ -118,8 +118,8 @@ def domain_wall_samples(
 
     They are the products of lines along the axes, and weigh the products of what their coordinates do. At the usual
     support each wall ends at its own edges, and its samples lie between the particles of a lattice that fills the
-    domain, as opposite to them they would hold it. Its last row, a little beyond the edge (`last_row`), gives such a
-    lattice in edges and corners the density that it has inside. A wall goes on for a row beyond an open face.
+    domain, as opposite to them they would hold it. Its last row lies a little beyond the edge (`last_row`), with which
+    edges and corners are no denser than their faces make them. A wall goes on for a row beyond an open face.
 
     At a wide support, whose sums reach far around edges, a line has points like a lattice of fluid within the domain,
     and at either end one for each layer of the wall, which weighs as much as a sample of the layer. As the kernel is
@@ -216,7 +216,7 @@ def _rows(domain: DomainParameters, axis: int, spacing: float) -> NDArray[np.flo
     low, high = domain.min[axis], domain.max[axis]
     count = max(round((high - low) / spacing), 1)
     apart = (high - low) / count
-    at_low, at_high = (f"{'xyz'[axis]}{side}" in domain.open_faces for side in "-+")
+    at_low, at_high = _open_ends(domain, axis)
     rows = low + apart * np.arange(-int(at_low), count + int(at_high) + 1)
     rows[0] -= 0.0 if at_low else last_row() * spacing
     rows[-1] += 0.0 if at_high else last_row() * spacing
@@ -231,22 +231,27 @@ def _points(domain: DomainParameters, axis: int, spacing: float, support_in_spac
     low, high = domain.min[axis], domain.max[axis]
     count = max(round((high - low) / spacing), 1)
     apart = (high - low) / count
-    beyond = [
-        math.ceil(0.5 * support_in_spacings) if f"{'xyz'[axis]}{side}" in domain.open_faces else 0 for side in "-+"
-    ]
+    beyond = [math.ceil(0.5 * support_in_spacings) * is_open for is_open in _open_ends(domain, axis)]
     points = low + apart * (np.arange(-beyond[0], count + beyond[1]) + 0.5)
     return np.stack([points, np.full(len(points), apart / spacing)], axis=1)
 
 
 def _layers(domain: DomainParameters, axis: int, spacing: float, support_in_spacings: float) -> NDArray[np.float64]:
     """Coordinates of the layers of the walls across an axis [m] with their weights in particles [-], (n, 2)."""
+    ends = zip((domain.min[axis], domain.max[axis]), (-1.0, 1.0), _open_ends(domain, axis), strict=True)
     layers = [
         (end + sign * (layer.standoff_in_spacings - 0.5) * spacing, layer.volume_in_particles)
-        for end, sign, side in ((domain.min[axis], -1.0, "-"), (domain.max[axis], 1.0, "+"))
-        if f"{'xyz'[axis]}{side}" not in domain.open_faces
+        for end, sign, is_open in ends
+        if not is_open
         for layer in wall_layers(support_in_spacings)
     ]
     return np.array(layers).reshape(-1, 2)
+
+
+def _open_ends(domain: DomainParameters, axis: int) -> tuple[bool, bool]:
+    """Whether the domain is open at the lower and at the upper end of an axis."""
+    low, high = (f"{'xyz'[axis]}{side}" in domain.open_faces for side in "-+")
+    return low, high
 
 
 @cache

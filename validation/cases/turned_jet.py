@@ -25,7 +25,7 @@ AWAY = 2.5  # distance of its tip from the wall at the start [a]
 STEADY, END = (11.5, 15.0)  # from when to when the flow is looked at [a/U]
 LEAVING = (3.0, 5.0)  # heights between which the sheet that leaves is looked at [a]
 CLEARANCE, CLEARANCE_ACROSS = 0.1, 0.02
-"""Of the lattice from floor and sides, in spacings: beside walls a lattice is compressed by 0.5 to 2.4 %. Without
+"""Of the lattice from floor and sides, in spacings: beside walls a lattice is compressed by 0.5 to 0.9 %. Without
 gravity nothing holds together again what that drives apart, at 6 % of U."""
 
 BINS = np.linspace(0.0, 3.0, 13)  # heights between which the pressure on the wall is averaged [a]
