@@ -57,11 +57,11 @@ def test_each_particle_of_a_still_tank_has_the_pressure_of_its_depth(taichi_cpu,
     inside = (height > 2 * spacing) & (height < high[2] - 2 * spacing)
     slope, _ = np.polyfit(height[inside], pressure[inside], 1)
     weight = 1000.0 * 9.81 * high[2]
-    # The water lies 0.8 % denser than a lattice (WCSPH: 1.0 %).
+    # The water lies 0.9 % denser than a lattice (WCSPH: 1.2 %).
     assert slope == pytest.approx(-1000.0 * 9.81, rel=0.015)
     error = np.abs(pressure - 1000.0 * 9.81 * (high[2] - height)) / weight
     assert error[inside].max() < 0.02  # of P single ones are off by 0.30, of the stress by 0.03
-    assert error.max() < 0.02  # at the floor, and in its edges and corners; of the stress up to 0.06
+    assert error.max() < 0.025  # at the floor, and in its edges and corners; of the stress up to 0.06
 
 
 def test_a_lattice_under_even_pressure_has_its_stress_everywhere(taichi_cpu):
