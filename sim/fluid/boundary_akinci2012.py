@@ -5,9 +5,9 @@ A sample b stands for the volume V_b = gamma / sum_k W_bk, the sum over the samp
 the samples belong together: with both, one layer of samples has the density and the push of a half-space of fluid
 (`sim.fluid.kernels.wall_calibration`). In the fluid's density a sample counts as Psi_b = rho0 V_b (eq. 5).
 
-A support wider than usual takes two layers, each with its own factor and distance (`sim.fluid.kernels.wall_layers`),
-and volumes that multiply where walls meet (`domain_wall_samples`). Bodies too thin for the second one keep to one
-layer, whose push alone lets nothing pass.
+A support wider than usual takes two layers, each with its own factor and distance (`sim.fluid.kernels.wall_layers`).
+Bodies too thin for the second one keep to one layer, whose push alone lets nothing pass. Walls of the domain are
+products of lines, with volumes that are known (`domain_wall_samples`).
 """
 
 from __future__ import annotations
@@ -15,13 +15,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, layer_field, particle_volume, wall_calibration, wall_layers
+from sim.fluid.kernels import (
+    SUPPORT_IN_SPACINGS,
+    evaluate,
+    lattice_offsets,
+    layer_field,
+    particle_volume,
+    wall_calibration,
+    wall_layers,
+)
 from sim.shapes.solid import SignedDistance, outward_normals
 
 if TYPE_CHECKING:
@@ -29,7 +39,6 @@ if TYPE_CHECKING:
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
 DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
-FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
 @dataclass(frozen=True)
@@ -105,27 +114,35 @@ class BoundarySamples:
 def domain_wall_samples(
     domain: DomainParameters, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS
 ) -> BoundarySamples:
-    """Samples of the domain's closed faces: a lattice 0.95 spacings outside of each face.
+    """Samples of the domain's closed faces, 0.95 spacings outside of each, or in two layers at a wide support.
 
-    Neighbouring walls share their edges and corners, and every sample lies there once. A wall reaches one layer
-    beyond an open face, so that fluid that runs along it is held until it has left.
+    They are the products of lines along the axes, and weigh the products of what their coordinates do. At the usual
+    support each wall ends at its own edges, and its samples lie between the particles of a lattice that fills the
+    domain, as opposite to them they would hold it. Its last row lies a little beyond the edge (`last_row`), with which
+    edges and corners are no denser than their faces make them. A wall goes on for a row beyond an open face.
 
-    With a support wider than usual a wall has two layers, and their sums reach far around edges. There the samples
-    are the products of three lines, one along each axis: points like a lattice of fluid within the domain, and at
-    either end one for each layer of the wall, which weighs as much as a sample of the layer. As the kernel is nearly
-    such a product too, fluid has the density in corners that it has inside, to 1.5 %.
+    At a wide support, whose sums reach far around edges, a line has points like a lattice of fluid within the domain,
+    and at either end one for each layer of the wall, which weighs as much as a sample of the layer. As the kernel is
+    nearly such a product too, fluid has the density in corners that it has inside, to 1.5 %.
     """
-    if len(wall_layers(support_in_spacings)) > 1:
-        return _product_wall_samples(domain, spacing, support_in_spacings)
-    depth = (wall_calibration(support_in_spacings).standoff_in_spacings - 0.5) * spacing
-    low, high = np.array(domain.min) - depth, np.array(domain.max) + depth
-    # Whole numbers of intervals, so the lattice meets both ends; the sample volumes even out the small stretch.
-    intervals = np.maximum(np.round((high - low) / spacing), 1).astype(int)
-    axes = [np.linspace(low[axis], high[axis], intervals[axis] + 1) for axis in range(3)]
-    faces = [_face_indices(face, intervals) for face in FACES if face not in domain.open_faces]
-    indices = np.unique(np.concatenate([np.empty((0, 3), dtype=int), *faces]), axis=0)
-    samples = np.stack([axes[axis][indices[:, axis]] for axis in range(3)], axis=1)
-    return BoundarySamples.of_points(samples)
+    is_usual = support_in_spacings == SUPPORT_IN_SPACINGS
+    insides = [
+        _rows(domain, axis, spacing) if is_usual else _points(domain, axis, spacing, support_in_spacings)
+        for axis in range(3)
+    ]
+    walls = [_layers(domain, axis, spacing, support_in_spacings) for axis in range(3)]
+    positions, weights = [np.empty((0, 3))], [np.empty(0)]
+    # Walls across x with all of y and z; then those across y, and across z, that are not among them.
+    for across in range(3):
+        chosen = [insides[a] if is_usual or a < across else np.concatenate([insides[a], walls[a]]) for a in range(3)]
+        chosen[across] = walls[across]
+        positions.append(np.stack(np.meshgrid(*(c[:, 0] for c in chosen), indexing="ij"), axis=-1).reshape(-1, 3))
+        weights.append(np.einsum("i,j,k->ijk", *(c[:, 1] for c in chosen)).ravel())
+    samples, weight = np.concatenate(positions), np.concatenate(weights)
+    outside = np.maximum(np.maximum(domain.min - samples, samples - domain.max), 0.0)
+    near = np.linalg.norm(outside, axis=1) < support_in_spacings * spacing
+    known = weight[near] * particle_volume(spacing, support_in_spacings)
+    return BoundarySamples.of_points(samples[near], known=known)
 
 
 def sink_samples(
@@ -194,51 +211,64 @@ def _weakened(standoff: NDArray[np.float64], wanted_standoff: float, support_in_
     return fields[-1] / np.interp(standoff, distances, fields)
 
 
-def _product_wall_samples(domain: DomainParameters, spacing: float, support_in_spacings: float) -> BoundarySamples:
-    lines = (_wall_line(domain, axis, spacing, support_in_spacings) for axis in range(3))
-    insides, walls = zip(*lines, strict=True)
-    points, weights = [np.empty((0, 3))], [np.empty(0)]
-    # Walls across x with all of y and z; then those across y, and across z, that are not among them.
-    for across in range(3):
-        chosen = [insides[a] if a < across else np.concatenate([insides[a], walls[a]]) for a in range(3)]
-        chosen[across] = walls[across]
-        points.append(np.stack(np.meshgrid(*(c[:, 0] for c in chosen), indexing="ij"), axis=-1).reshape(-1, 3))
-        products = np.meshgrid(*(c[:, 1] for c in chosen), indexing="ij")
-        weights.append((products[0] * products[1] * products[2]).ravel())
-    positions, weight = np.concatenate(points), np.concatenate(weights)
-    outside = np.maximum(np.maximum(domain.min - positions, positions - domain.max), 0.0)
-    near = np.linalg.norm(outside, axis=1) < support_in_spacings * spacing
-    known = weight[near] * particle_volume(spacing, support_in_spacings)
-    return BoundarySamples.of_points(positions[near], known=known)
+def _rows(domain: DomainParameters, axis: int, spacing: float) -> NDArray[np.float64]:
+    """Coordinates of a wall's rows along an axis [m] with their weights in particles [-], (n, 2)."""
+    low, high = domain.min[axis], domain.max[axis]
+    count = max(round((high - low) / spacing), 1)
+    apart = (high - low) / count
+    at_low, at_high = _open_ends(domain, axis)
+    rows = low + apart * np.arange(-int(at_low), count + int(at_high) + 1)
+    rows[0] -= 0.0 if at_low else last_row() * spacing
+    rows[-1] += 0.0 if at_high else last_row() * spacing
+    return np.stack([rows, np.full(len(rows), apart / spacing)], axis=1)
 
 
-def _wall_line(
-    domain: DomainParameters, axis: int, spacing: float, support_in_spacings: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coordinates along an axis [m] with their weights in particles [-]: of fluid, and of the walls across it, (n, 2).
+def _points(domain: DomainParameters, axis: int, spacing: float, support_in_spacings: float) -> NDArray[np.float64]:
+    """Coordinates of a lattice of fluid along an axis [m] with their weights in particles [-], (n, 2).
 
-    Beyond an open face the fluid's points go on for half of the support.
+    Beyond an open face they go on for half of the support.
     """
     low, high = domain.min[axis], domain.max[axis]
     count = max(round((high - low) / spacing), 1)
-    stretched = (high - low) / count
-    beyond = [
-        math.ceil(0.5 * support_in_spacings) if f"{'xyz'[axis]}{side}" in domain.open_faces else 0 for side in "-+"
-    ]
-    inside = low + stretched * (np.arange(-beyond[0], count + beyond[1]) + 0.5)
-    walls = [
+    apart = (high - low) / count
+    beyond = [math.ceil(0.5 * support_in_spacings) * is_open for is_open in _open_ends(domain, axis)]
+    points = low + apart * (np.arange(-beyond[0], count + beyond[1]) + 0.5)
+    return np.stack([points, np.full(len(points), apart / spacing)], axis=1)
+
+
+def _layers(domain: DomainParameters, axis: int, spacing: float, support_in_spacings: float) -> NDArray[np.float64]:
+    """Coordinates of the layers of the walls across an axis [m] with their weights in particles [-], (n, 2)."""
+    ends = zip((domain.min[axis], domain.max[axis]), (-1.0, 1.0), _open_ends(domain, axis), strict=True)
+    layers = [
         (end + sign * (layer.standoff_in_spacings - 0.5) * spacing, layer.volume_in_particles)
-        for end, sign, open_layers in ((low, -1.0, beyond[0]), (high, 1.0, beyond[1]))
-        if not open_layers
+        for end, sign, is_open in ends
+        if not is_open
         for layer in wall_layers(support_in_spacings)
     ]
-    weights = np.full(len(inside), stretched / spacing)
-    return np.stack([inside, weights], axis=1), np.array(walls).reshape(-1, 2)
+    return np.array(layers).reshape(-1, 2)
 
 
-def _face_indices(face: str, intervals: NDArray[np.integer]) -> NDArray[np.integer]:
-    """Lattice indices of one face of a box of so many intervals, (m, 3)."""
-    ranges = [np.arange(count + 1) for count in intervals]
-    normal = "xyz".index(face[0])
-    ranges[normal] = ranges[normal][:1] if face[1] == "-" else ranges[normal][-1:]
-    return np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)
+def _open_ends(domain: DomainParameters, axis: int) -> tuple[bool, bool]:
+    """Whether the domain is open at the lower and at the upper end of an axis."""
+    low, high = (f"{'xyz'[axis]}{side}" in domain.open_faces for side in "-+")
+    return low, high
+
+
+@cache
+def last_row() -> float:
+    """How far beyond an edge the last row of a wall lies [spacings].
+
+    Two walls that meet both stand for the fluid beyond both of them. With this row each leaves half of that out, in the
+    first layer of a lattice. Its push along the wall stays the same, to 0.04 %, as the slope of its field has its
+    largest value there: floors bear what stands on them, and side walls nothing.
+    """
+    wall = wall_calibration()
+    offsets = lattice_offsets()
+    beyond_both = np.linalg.norm(offsets[(offsets[:, :2] < 0.0).all(axis=1)], axis=1)
+    twice = 0.5 * float(evaluate(beyond_both, SUPPORT_IN_SPACINGS).sum()) / wall.volume_in_particles
+    along = np.hypot(np.arange(-2, 2) + 0.5, wall.standoff_in_spacings)
+
+    def row(away: float) -> float:
+        return float(evaluate(np.hypot(along, away), SUPPORT_IN_SPACINGS).sum())
+
+    return float(brentq(lambda beyond: row(0.5) - row(0.5 + beyond) - twice, 0.0, 0.5))

@@ -29,8 +29,8 @@ HELD = "held"
 PATIENCE = 4.0  # how long it is held at least before it changes places, over d/u, and up to twice that by its id [-]
 AT_REST = 0.2  # vertical speed over u below which a particle neither rises nor sinks [-]
 SLIDING = 1.0  # speed over u at which the two slide along each other, from which on this is a flow [-]
-LEAST_COSINE = 0.6  # of the angle to the vertical under which the heavier particle is seen
-FARTHEST = 1.5  # and its distance [spacings]
+LEAST_COSINE = 0.4  # of the angle to the vertical under which the heavier particle is seen
+FARTHEST = 1.7  # and its distance [spacings]
 GOLDEN = 0.618034  # its multiples' fractions spread successive ids evenly
 
 

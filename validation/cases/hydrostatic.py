@@ -31,7 +31,8 @@ def stand(solver: str, layers: int) -> dict[str, Any]:
         times.append(time)
         speeds.append(float(np.sqrt((velocity**2).sum(axis=1).mean())))
         samples, pushes = wall_forces(fluid)
-        forces.append(-float(pushes[samples[:, 2] < 0.0, 2].sum()) / weight)
+        of_floor = samples[:, 2] < -0.5 * spacing  # which lie 0.95 spacings deep; other walls end 0.05 beneath
+        forces.append(-float(pushes[of_floor, 2].sum()) / weight)
         if time > SETTLED:
             heights.append(position[:, 2])
             pressures.append(fluid.snapshots()[fluid.name].arrays["pressure"])

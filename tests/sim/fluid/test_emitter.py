@@ -378,8 +378,8 @@ def test_walls_keep_their_friction_beyond_the_reach_of_an_opening(taichi_cpu):
 def test_the_samples_of_a_wall_in_a_mouth_weigh_nothing(taichi_cpu):
     boundary = jet(FROM_BELOW, domain=BASIN).boundary
     position, volume = (array.to_numpy() for array in (boundary.samples.position, boundary.samples.volume))
-    floor = position[: boundary.fixed_count, 2] < 0.0
-    in_mouth = np.abs(position[: boundary.fixed_count, :2]).max(axis=1) < 0.04
+    floor = position[: boundary.fixed_count, 2] < -0.5 * SPACING  # other walls end 0.05 spacings beneath
+    in_mouth = np.abs(position[: boundary.fixed_count, :2]).max(axis=1) < 0.05
     weight = volume[: boundary.fixed_count]
     assert (weight[floor & in_mouth] == 0.0).all()
     assert (weight[floor & ~in_mouth & (np.abs(position[: boundary.fixed_count, :2]).max(axis=1) > 0.055)] > 0.0).all()

@@ -57,11 +57,11 @@ def test_each_particle_of_a_still_tank_has_the_pressure_of_its_depth(taichi_cpu,
     inside = (height > 2 * spacing) & (height < high[2] - 2 * spacing)
     slope, _ = np.polyfit(height[inside], pressure[inside], 1)
     weight = 1000.0 * 9.81 * high[2]
-    # The water lies 0.8 % denser than a lattice (WCSPH: 1.0 %).
+    # The water lies 0.9 % denser than a lattice (WCSPH: 1.2 %).
     assert slope == pytest.approx(-1000.0 * 9.81, rel=0.015)
     error = np.abs(pressure - 1000.0 * 9.81 * (high[2] - height)) / weight
     assert error[inside].max() < 0.02  # of P single ones are off by 0.30, of the stress by 0.03
-    assert error.max() < 0.03  # at the floor, and in its edges and corners; of the stress up to 0.06
+    assert error.max() < 0.025  # at the floor, and in its edges and corners; of the stress up to 0.06
 
 
 def test_a_lattice_under_even_pressure_has_its_stress_everywhere(taichi_cpu):
@@ -71,13 +71,20 @@ def test_a_lattice_under_even_pressure_has_its_stress_everywhere(taichi_cpu):
     fluid.particles.carried["pressure"].fill(1.0)
     position = fluid.particles.host(fluid.particles.position)
     stress = fluid._mechanical_pressure.stress_of(fluid.tank.on_device, fluid.pressure_term)
-    layer = np.minimum(position, size - position).min(axis=1) / spacing
+    walls_near = (np.minimum(position, size - position) < spacing).sum(axis=1)
     # Half of the bonds of a particle in a lattice, force times length, a third of the trace: 1.02.
     distances = np.linalg.norm(lattice_offsets(), axis=1)
     carried = -particle_volume(1.0) / 3.0 * float((distances * evaluate_slope(distances, 2.0)).sum())
-    np.testing.assert_allclose(stress[layer > 1.0], carried, rtol=1.0e-5)  # float32 sums
+    np.testing.assert_allclose(stress[walls_near == 0], carried, rtol=1.0e-5)  # float32 sums
     # Beside walls, in edges and in corners some bonds along the wall lack; with none of the wall it would be 0.66.
-    np.testing.assert_allclose(stress[layer < 1.0], carried, rtol=0.051)
+    for walls, tolerance in ((1, 0.05), (2, 0.058), (3, 0.035)):
+        np.testing.assert_allclose(stress[walls_near == walls], carried, rtol=tolerance)
+    # What is told has the gradient of the forces, which push a lattice out of corners that are too dense: where these
+    # had 5.7 % too much density it was 20 % too much there, and 8.2 % in edges.
+    arrays = fluid.snapshots()["water"].arrays
+    walls_near = (np.minimum(arrays["position"], size - arrays["position"]) < spacing).sum(axis=1)
+    for walls, tolerance in ((1, 0.055), (2, 0.075), (3, 0.175)):
+        np.testing.assert_allclose(arrays["pressure"][walls_near == walls], carried, rtol=tolerance)
 
 
 @pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])

@@ -76,7 +76,7 @@ def test_what_a_room_has_no_space_for_stirs_it_little(taichi_cpu, solver):
     run(fluid, 0.2)
     velocity = fluid.snapshots()["water"].arrays["velocity"]
     # Two percent too much, which no pressure can take back: what tried to stirred it at 0.30 m/s, and PCISPH at 4.
-    assert np.sqrt((velocity**2).sum(axis=1).mean()) < {"dfsph": 0.25, "pcisph": 0.7}[solver]
+    assert np.sqrt((velocity**2).sum(axis=1).mean()) < {"dfsph": 0.24, "pcisph": 0.6}[solver]
 
 
 @EVERY
