@@ -32,8 +32,11 @@ APART = math.log(8.0)
 DENSE = 0.95
 """Density over that at rest from which on sand that was apart presses again [-]; below 1, as particles lie anyhow."""
 
-MOST_HARDENED, LEAST_HARDENED = 3.0, -2.0
-"""Exponents of snow's hardening at most and at least, exp(3) = 20 times as stiff: steps get shorter with its root."""
+MOST_CRUSHED = 0.56
+"""Part of its volume that snow lost for good up to which it gets harder: that of snow of 400 kg/m³ that became ice."""
+
+LEAST_HARDENED = -2.0
+"""Least exponent of snow's hardening, where it came apart."""
 
 
 @bundle
@@ -198,7 +201,7 @@ def stress_of_hencky(strain: Vector, mu: ti.f32, lam: ti.f32) -> Vector:
 @func
 def hardened(hardening: ti.f32, plastic: ti.f32) -> ti.f32:
     """Factor on the moduli of snow whose plastic Hencky strain of volume is given (Stomakhin et al. 2013, 6)."""
-    return ti.exp(ti.math.clamp(hardening * -expm1(plastic), LEAST_HARDENED, MOST_HARDENED))
+    return ti.exp(ti.max(hardening * ti.min(-expm1(plastic), MOST_CRUSHED), LEAST_HARDENED))
 
 
 @func

@@ -231,3 +231,6 @@ def test_snow_breaks_beyond_its_stretches_and_is_harder_once_crushed():
     _, (fresh,), _ = answered(body, [same])
     _, (crushed,), _ = answered(body, [same], history=-0.05)
     np.testing.assert_allclose(crushed / fresh, math.exp(-10.0 * math.expm1(-0.05)), rtol=1e-3)
+    # It gets harder as far as it can be crushed: snow of 400 kg/m³ is ice once 0.44 of its volume are left.
+    _, (ice,), _ = answered(body, [same], history=math.log(0.44))
+    np.testing.assert_allclose(ice / fresh, math.exp(5.6), rtol=1e-3)

@@ -236,3 +236,15 @@ def test_blocks_that_are_kept_while_particles_go_half_a_cell_give_the_bits_of_bl
     assert 1 < few < 20 and many == 40
     for name, array in kept.items():
         np.testing.assert_array_equal(array, anew[name], err_msg=name)
+
+
+def test_a_snowball_at_20_metres_a_second_is_crushed_to_the_density_of_firn_not_beyond_ice():
+    """Crushing takes E theta/xi (exp(xi (1 - J)) - 1) a volume, 80 kJ/m³ at J = 0.46; cells at the front get more."""
+    ball = {"shape": {"type": "sphere", "radius": 0.04}, "position": (0.0, 0.0, -0.45), "velocity": (0.0, 0.0, -20.0)}
+    body = SoftParameters(name="it", material="snow", cell_size=0.01, block=(ball,))
+    solver = SoftSolver([body], domain=DOMAIN, gravity=FREE)
+    advance(solver, 0.012)
+    density = 400.0 * np.exp(-solver.particles.history.to_numpy())
+    assert 600.0 < np.median(density) < 800.0
+    assert np.quantile(density, 0.95) < 917.0
+    assert solver.view("it")["velocity"][:, 2].mean() > 0.0
