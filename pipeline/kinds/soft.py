@@ -38,6 +38,7 @@ LOOKS: dict[str, MaterialParameters] = {
     "sand": MaterialParameters(look="sand"),
     "wet_sand": MaterialParameters(look="sand", color=(0.32, 0.22, 0.13)),
     "snow": MaterialParameters(look="snow"),
+    "packed_snow": MaterialParameters(look="snow"),
     "jelly": MaterialParameters(look="jelly"),
     "rubber": MaterialParameters(look="rubber"),
     "clay": MaterialParameters(look="stone", color=(0.45, 0.24, 0.15)),

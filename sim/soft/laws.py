@@ -55,6 +55,7 @@ class Laws(NamedTuple):
     least: Floats  # SNOW: least and largest stretch [-]
     most: Floats
     hardening: Floats  # SNOW [-]
+    tearing: Floats  # SNOW: strain beyond its stretch in which cohesion decays to 1/e [-]; 0: it keeps it
 
 
 @ti.func
@@ -205,13 +206,15 @@ def hardened(hardening: ti.f32, plastic: ti.f32) -> ti.f32:
 
 
 @func
-def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
-    """What becomes of a trial strain e in a step of dt [s]: the elastic strain, the Kirchhoff stress [Pa], the history.
+def respond(trial: Matrix, b: ti.i32, history: ti.f32, cohesion: ti.f32, dt: ti.f32, laws: Laws):
+    """What becomes of a trial strain e in a step of dt [s]: elastic strain, Kirchhoff stress [Pa], history, cohesion.
 
-    The history is the Hencky strain of volume that sand in tension has gained, or that snow lost for good.
+    The history is the Hencky strain of volume that sand in tension has gained, or that snow lost for good. Cohesion is
+    the share of its critical stretch that snow still bears: a crack, smeared over a cell, takes as much energy in cells
+    of any size (Bazant & Oh 1983), and what is crushed denser than at rest sticks again.
     """
     law, mu, lam = laws.law[b], laws.mu[b], laws.lam[b]
-    e, stress, told = trial, Matrix(0.0), history
+    e, stress, told, left = trial, Matrix(0.0), history, cohesion
     gained = -1.0
     if law == ti.static(int(Law.SAND)):
         gained = volume_strain(trial) + history - laws.tip[b]
@@ -233,7 +236,12 @@ def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
             after = yielded_clay(strain, b, dt, laws)
         else:
             least, most = 0.5 * log1p(laws.least[b] ** 2 - 1.0), 0.5 * log1p(laws.most[b] ** 2 - 1.0)
+            if history < 0.0 and strain.min() < least:
+                left = 1.0
+            most *= left
             after = ti.min(ti.max(strain, least), most)
+            if laws.tearing[b] > 0.0:
+                left *= ti.exp(-ti.max(strain - most, 0.0).sum() / laws.tearing[b])
             told = history + (strain - after).sum()
         tau = stress_of_hencky(after, mu, lam)
         if law == ti.static(int(Law.SNOW)):
@@ -248,4 +256,4 @@ def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
             for k in ti.static(range(3)):
                 values[k] = expm1(2.0 * after[k])
             e = recomposed(axes, values)
-    return e, stress, told
+    return e, stress, told, left

@@ -44,7 +44,7 @@ class SoftParameters(Parameters):
     """A body of soft matter: what it is made of, how finely it is computed, and where it is and comes in."""
 
     name: BodyName = Field(description="Name of the body, unique in the job.")
-    material: Literal["sand", "wet_sand", "snow", "jelly", "rubber", "clay", "dough", "cream"] = Field(
+    material: Literal["sand", "wet_sand", "snow", "packed_snow", "jelly", "rubber", "clay", "dough", "cream"] = Field(
         description="What it is made of, which gives the keys below that are omitted: "
         + "; ".join(f"{name}: {row.about}" for name, row in MATERIALS.items())
         + "."
@@ -88,6 +88,11 @@ class SoftParameters(Parameters):
     )
     hardening: NonNegative | None = Field(
         default=None, description="Exponent by which it gets harder where it is crushed [-]; of snow."
+    )
+    fracture_energy: Positive | None = Field(
+        default=None,
+        description="Energy that tears it apart, for the area of a crack [J/m²], whatever the cells; what is torn has "
+        "no cohesion until it is crushed. Without it, it flows instead of tearing; of snow.",
     )
     friction: NonNegative = Field(
         default=0.5,

@@ -51,7 +51,7 @@ SOLVER_NAME = "soft"
 
 MOTION_NUMBER = 0.3  # cells that a particle crosses in it
 
-STATE = ("position", "velocity", "affine", "strain", "stress", "history", "body")
+STATE = ("position", "velocity", "affine", "strain", "stress", "history", "cohesion", "body")
 """Arrays that a checkpoint has."""
 
 TINY_SPEED = 1.0e-12  # of what does not move at all [m/s]
@@ -118,7 +118,10 @@ class SoftSolver:
         is_sand = np.array([each.row.law == Law.SAND for each in self.parameters])
         self._has_sand = bool(is_sand.any())
         history = on_device(np.where((body < 0) & is_sand[self.owner], np.float32(APART), np.float32(0.0)))
-        self.particles = Particles(on_device(position), on_device(velocity), *rows_of, history, on_device(body), n)
+        has_snow = any(each.row.law == Law.SNOW for each in self.parameters)
+        cohesion = on_device(np.ones(n if has_snow else 1, np.float32))
+        rows = on_device(position), on_device(velocity), *rows_of, history, cohesion, on_device(body)
+        self.particles = Particles(*rows, n)
         self.spacing = self.parameters[0].spacing
         self.masses, self.volume = on_device(particle_mass), volume
         self._load_particles(0)
@@ -382,6 +385,8 @@ def laws_of(parameters: Sequence[SoftParameters]) -> Laws:
         power = 1.0 / (each.value("flow_exponent") or 1.0)
         flowing = 2.0 ** (0.5 - 0.5 * power) * (each.value("viscosity") / mu) ** power
         dense, hardening = DENSE * each.value("density"), each.value("hardening")
-        rows.append((dense, mu, lam, slope, tip, yielding, flowing, power, least, most, hardening))
+        tensile = each.value("young_modulus") * each.value("critical_stretch")
+        tearing = each.value("fracture_energy") / (tensile * each.cell_size) if tensile > 0.0 else 0.0
+        rows.append((dense, mu, lam, slope, tip, yielding, flowing, power, least, most, hardening, tearing))
     law = np.array([int(each.row.law) for each in parameters], dtype=np.int32)
     return Laws(on_device(law), *(on_device(np.array(column)) for column in zip(*rows, strict=True)))
