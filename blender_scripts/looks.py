@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -127,13 +128,15 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
     builder.volume(both)
 
 
-def _with_dye(builder: NodeBuilder, context: LookContext, color: Color) -> Any:
-    """A colour, or the output socket of what dye makes of it."""
+def _with_dye(
+    builder: NodeBuilder, context: LookContext, color: Any, shaded: Callable[[Color], Any] = lambda color: color
+) -> Any:
+    """A colour or its socket, or the socket of what dye makes of it, whose own colour is shaded in the same way."""
     if context.dye_color is None:
         return color
     dye = builder.node("ShaderNodeAttribute")
     dye.attribute_name = DYE
-    return builder.mix_colors(dye.outputs[2], color, context.dye_color)
+    return builder.mix_colors(dye.outputs[2], color, shaded(context.dye_color))
 
 
 def _cloudy(builder: NodeBuilder, context: LookContext, *, look: str, reflectance: Color) -> None:
@@ -171,8 +174,7 @@ def _glass(builder: NodeBuilder, context: LookContext) -> None:
 @draws("stone")
 def _stone(builder: NodeBuilder, context: LookContext) -> None:
     """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
-    stone = or_default(context.color, (0.32, 0.30, 0.28))
-    red, green, blue = context.own_shade(stone, brightness=0.35, warmth=0.1)
+    stone = context.own_shade(or_default(context.color, (0.32, 0.30, 0.28)), brightness=0.35, warmth=0.1)
     coordinates = builder.node("ShaderNodeTexCoord").outputs
     # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box. Ground
     # that reaches to the horizon has as many in the domain's size.
@@ -187,13 +189,18 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
         place = builder.vector_math("ADD", place, way)
     noise = builder.noise(place, Scale=scale, Detail=6.0, Roughness=0.62)
     depth = 0.006 * context.domain_size if context.edges is None else 0.03 * math.hypot(*context.edges)
-    dark = (0.55 * red, 0.55 * green, 0.55 * blue)
-    light = (min(1.0, 1.35 * red), min(1.0, 1.35 * green), min(1.0, 1.35 * blue))
+
+    def mottled(color: Color) -> Any:
+        red, green, blue = color
+        dark = (0.55 * red, 0.55 * green, 0.55 * blue)
+        light = (min(1.0, 1.35 * red), min(1.0, 1.35 * green), min(1.0, 1.35 * blue))
+        return builder.ramp(noise, (0.3, dark), (0.72, light))
+
     bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=depth, Height=noise)
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
         Base_Color=builder.own_tint(
-            context, builder.ramp(noise, (0.3, dark), (0.72, light)), brightness=0.35, warmth=0.1
+            context, _with_dye(builder, context, mottled(stone), mottled), brightness=0.35, warmth=0.1
         ),
         Roughness=or_default(context.roughness, 0.8),
         Specular_IOR_Level=0.3,
@@ -273,12 +280,22 @@ def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
 @draws("sand")
 def _sand(builder: NodeBuilder, context: LookContext) -> None:
     """Grains of quartz and feldspar: each of a shade of its own, a few of them dark, and dull."""
-    red, green, blue = or_default(context.color, (0.56, 0.40, 0.24))
     number = builder.node("ShaderNodePointInfo").outputs["Random"]
-    dark = (0.35 * red, 0.35 * green, 0.35 * blue)
-    light = (min(1.0, 1.3 * red), min(1.0, 1.3 * green), min(1.0, 1.35 * blue))
-    color = builder.ramp(number, (0.04, dark), (0.15, (0.8 * red, 0.8 * green, 0.8 * blue)), (0.95, light))
-    _even(builder, context, color=color, roughness=0.75, Specular_IOR_Level=0.3)
+
+    def shaded(color: Color) -> Any:
+        red, green, blue = color
+        dark = (0.35 * red, 0.35 * green, 0.35 * blue)
+        light = (min(1.0, 1.3 * red), min(1.0, 1.3 * green), min(1.0, 1.35 * blue))
+        return builder.ramp(number, (0.04, dark), (0.15, (0.8 * red, 0.8 * green, 0.8 * blue)), (0.95, light))
+
+    color = _with_dye(builder, context, shaded(or_default(context.color, (0.56, 0.40, 0.24))), shaded)
+    shader = builder.node(
+        "ShaderNodeBsdfPrincipled",
+        Base_Color=color,
+        Roughness=or_default(context.roughness, 0.75),
+        Specular_IOR_Level=0.3,
+    )
+    builder.surface(shader)
 
 
 @draws("snow")
@@ -341,7 +358,7 @@ def _even(builder: NodeBuilder, context: LookContext, *, color: Any, roughness: 
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=or_default(context.color, color),
+            Base_Color=_with_dye(builder, context, or_default(context.color, color)),
             Roughness=or_default(context.roughness, roughness),
             **inputs,
         )

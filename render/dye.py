@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from render.meshes import SurfaceMesh
+
 SUPPORT_IN_RADII = 4.0
 """Width of the kernel, as in the simulation: a vertex has half of its neighbours there, a dozen."""
 _NEIGHBOURS = 24
@@ -16,6 +18,21 @@ _MOST_CELLS = 2**25
 _STEP_IN_CELLS = 0.5
 _LEAST_FILLED = 0.3  # of a cell, of what is liquid; behind what is not the dye is another surface's
 _SKIN_IN_CELLS = 1.5  # so deep below the surface cells are only partly filled
+
+
+def dye_of(
+    surface: SurfaceMesh, positions: ArrayLike, dye: ArrayLike | None, *, particle_radius: float
+) -> dict[str, NDArray[np.float32]]:
+    """What `write_ply` writes of the dye of particles beside their surface, by its names; nothing where they have none.
+
+    Arguments are those of `dye_at`.
+    """
+    if dye is None:
+        return {}
+    assert surface.normals is not None
+    at = dye_at(surface.vertices, positions, dye, particle_radius=particle_radius)
+    behind = dye_behind(surface.vertices, surface.normals, positions, dye, particle_radius=particle_radius)
+    return {"dye": at, "dye_behind": behind}
 
 
 def dye_at(vertices: ArrayLike, positions: ArrayLike, dye: ArrayLike, *, particle_radius: float) -> NDArray[np.float32]:

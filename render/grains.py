@@ -14,7 +14,12 @@ SEED = 20_261_130
 
 
 def grains_of(
-    position: NDArray[np.generic], velocity: NDArray[np.generic], particle_id: NDArray[np.generic], *, radius: float
+    position: NDArray[np.generic],
+    velocity: NDArray[np.generic],
+    particle_id: NDArray[np.generic],
+    dye: NDArray[np.generic] | None = None,
+    *,
+    radius: float,
 ) -> PointCloud:
     """Grains of particles with a spacing of two radii [m]: at fixed places about each, of sizes of their own.
 
@@ -25,6 +30,7 @@ def grains_of(
         position: of particles [m], (n, 3).
         velocity: of particles [m/s], (n, 3).
         particle_id: which each is, (n,).
+        dye: concentration in each [-], (n,); None where they have none.
         radius: half the spacing of particles at rest [m].
     """
     table = np.random.Generator(np.random.PCG64(SEED))
@@ -43,4 +49,5 @@ def grains_of(
         radius=sizes[chosen].ravel().astype(np.float32),
         lifetime=np.ones(n, np.float32),
         kind=np.zeros(n, np.uint8),
+        dye=None if dye is None else np.repeat(dye, GRAINS_A_PARTICLE).astype(np.float32),
     )

@@ -307,9 +307,9 @@ class MaterialParameters(Parameters):
 
     dye_color: Color | None = Field(
         default=None,
-        description="Liquids: colour of a fluid whose dye has the concentration 1, linear RGB, beside color, that of "
-        "the concentration 0. In milk, juice and muddy water they mix evenly on the surface; in clear ones dye takes "
-        "light away by how much of it lies behind.",
+        description="Liquids and soft matter: colour where dye has the concentration 1, linear RGB, beside color, "
+        "that of the concentration 0. In clear liquids dye takes light away by how much of it lies behind; everywhere "
+        "else they mix evenly on the surface, and on grains.",
     )
 
     @field_validator("blend")

@@ -35,7 +35,7 @@ class PointCloud:
         lifetime: what is left of it [s], (n,), float32; drops do not fade.
         kind: index into `KINDS`, (n,), uint8.
         not_made: particles that the frame should have got, and had no room for.
-        dye: concentration [-], (n,), float32, of drops of a fluid with dye; else None.
+        dye: concentration [-], (n,), float32, of drops and grains of what has dye; else None.
         temperature: [K], (n,), float32, of embers; else None. A cloud has one of both at most.
     """
 

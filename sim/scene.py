@@ -10,7 +10,7 @@ from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Device, KeyRefusedError, Parameters, Vector3, composed
 from sim.embers.parameters import EmberParameters
-from sim.fluid.parameters import FluidParameters, dye_conflict
+from sim.fluid.parameters import FluidParameters, tank_dye_conflict
 from sim.forces.parameters import MOST_FORCES, Force, unknown_targets
 from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters
@@ -66,7 +66,7 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_dye_that_mixes(self) -> Self:
-        if conflict := dye_conflict(self.fluid):
+        if conflict := tank_dye_conflict(self.fluid):
             number, reason = conflict
             raise KeyRefusedError(("fluid", number), reason)
         return self

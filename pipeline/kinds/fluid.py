@@ -24,7 +24,7 @@ from pipeline.model.looks import BODY, POINTS, WHITEWATER
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_particles
-from render.dye import dye_at, dye_behind
+from render.dye import dye_of
 from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
@@ -38,7 +38,6 @@ from sim.whitewater.kinds import LiquidKind, mean_diameter
 
 if TYPE_CHECKING:
     import h5py
-    from numpy.typing import NDArray
 
 WETS_WITHIN_RADII = 1.5
 """How near a fluid's surface is to what it touches, in radii of its particles: up to 0.8 above moving ones."""
@@ -176,12 +175,10 @@ def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
         volume=len(meshed) * (2.0 * radius) ** 3 - fluid.number("volume_of_drops"),
         threads=threads,
     )
-    dyed: dict[str, NDArray[np.float32]] = {}
-    if (dye := fluid.arrays.get("dye")) is not None:
-        assert surface.normals is not None
-        particles, all_dye = fluid.arrays["position"][meshed], dye[meshed]
-        behind = dye_behind(surface.vertices, surface.normals, particles, all_dye, particle_radius=radius)
-        dyed = {"dye": dye_at(surface.vertices, particles, all_dye, particle_radius=radius), "dye_behind": behind}
+    dye = fluid.arrays.get("dye")
+    dyed = dye_of(
+        surface, fluid.arrays["position"][meshed], None if dye is None else dye[meshed], particle_radius=radius
+    )
     write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities, **dyed)
 
 

@@ -19,6 +19,7 @@ from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_particles
+from render.dye import dye_of
 from render.grains import GRAINS_A_PARTICLE, grains_of
 from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
@@ -37,6 +38,7 @@ LOOKS: dict[str, MaterialParameters] = {
     "sand": MaterialParameters(look="sand"),
     "wet_sand": MaterialParameters(look="sand", color=(0.32, 0.22, 0.13)),
     "snow": MaterialParameters(look="snow"),
+    "packed_snow": MaterialParameters(look="snow"),
     "jelly": MaterialParameters(look="jelly"),
     "rubber": MaterialParameters(look="rubber"),
     "clay": MaterialParameters(look="stone", color=(0.45, 0.24, 0.15)),
@@ -96,14 +98,16 @@ def _reach(_job: Job, _layout: JobLayout, _soft: SoftParameters, group: h5py.Gro
 
 
 def _write(path: Path, soft: Snapshot, job: Job, threads: int) -> None:
-    arrays, radius = soft.arrays, soft.number("radius")
+    arrays, radius, dye = soft.arrays, soft.number("radius"), soft.arrays.get("dye")
     if MATERIALS[str(soft.attributes["material"])].law in GRAINY:
-        write_point_cloud(path, grains_of(arrays["position"], arrays["velocity"], arrays["particle_id"], radius=radius))
+        cloud = grains_of(arrays["position"], arrays["velocity"], arrays["particle_id"], dye, radius=radius)
+        write_point_cloud(path, cloud)
         return
     surface = reconstruct_surface(
         arrays["position"], arrays["velocity"], particle_radius=radius, parameters=job.surface, threads=threads
     )
-    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities)
+    dyed = dye_of(surface, arrays["position"], dye, particle_radius=radius)
+    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities, **dyed)
 
 
 def _validate(path: Path) -> None:
@@ -119,7 +123,7 @@ MATTER = Product(
     version=1,
     folder="soft",
     suffix=".ply",
-    tools=lambda _job: {name: tool_version(name) for name in ("pysplashsurf", "numpy")},
+    tools=lambda _job: {name: tool_version(name) for name in ("pysplashsurf", "numpy", "scipy")},
     parameters=lambda job: {"surface": job.surface.model_dump(mode="json")},
     memory_bytes=lambda _job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft)),
     write=_write,

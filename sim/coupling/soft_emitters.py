@@ -31,5 +31,5 @@ def poured_by(soft: Sequence[SoftParameters]) -> Poured:
                 time_s = opening.leaves_at(layer)
                 points, carrier = opening.points(layer, time_s), opening.motion(time_s)
                 velocity = opening.velocity_at(points, carrier, opening.inflow.speed_at(time_s))
-                layers.append(Poured.of_layer(points, velocity, time_s, index))
+                layers.append(Poured.of_layer(points, velocity, time_s, index, emitter.dye))
     return Poured.together(layers)

@@ -8,31 +8,21 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.core.parameters import BodyName, Fraction, NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
 from sim.core.water import CAPILLARY_LENGTH, TENSION_OF_WATER
 from sim.fluid.traits import CAPILLARY_NUMBER, CFL_NUMBER, COHESION_NUMBER, TRAITS, VISCOUS_NUMBER
+from sim.shapes.filled_parameters import Blocks, dye_conflict
 from sim.shapes.openings import InflowParameters
-from sim.shapes.parameters import Placement
 
 WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
 
 SLIPPERY_ANGLE_DEG = 45.0  # contact angle below which a drop that spreads on a smooth wall tears [degrees]
 SPREADING_FRICTION = 5.0  # of walls, with which it does not [-]
 
-_DYE = "Concentration of dye, from 0 to 1 [-], which has the colour dye_color of the fluid's material,"
-
-
-class FluidBlockParameters(Placement):
-    """A volume filled with fluid at the start."""
-
-    velocity: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Initial velocity [m/s].")
-    dye: Fraction = Field(default=0.0, description=f"{_DYE} at the start.")
-
 
 class EmitterParameters(InflowParameters):
     """An opening from which fluid flows into the domain, free as soon as it has passed it."""
 
-    dye: Fraction = Field(default=0.0, description=f"{_DYE} of what flows in.")
     follow: str | None = Field(
         default=None,
         description="Name of the rigid body that it is fixed to: position, direction and rotation_deg are then along "
@@ -61,7 +51,7 @@ class FluidParameters(Parameters):
         description="wcsph: weakly compressible SPH (Becker & Teschner 2007); dfsph: divergence-free SPH (Bender & "
         "Koschier 2015); pcisph: predictive-corrective incompressible SPH (Solenthaler & Pajarola 2009).",
     )
-    block: tuple[FluidBlockParameters, ...] = Field(default=(), description="Volumes filled at the start.")
+    block: Blocks = Field(default=(), description="Volumes filled at the start.")
     emitter: tuple[EmitterParameters, ...] = Field(default=(), description="Openings from which fluid flows in.")
     max_particles: Annotated[int, Field(ge=1, le=2**31 - 1)] | None = Field(
         default=None,
@@ -179,14 +169,9 @@ class FluidParameters(Parameters):
         return self.spacing**3
 
     @property
-    def dyes(self) -> set[float]:
-        """The concentrations of dye that it starts, or flows in, with."""
-        return {each.dye for each in (*self.block, *self.emitter)}
-
-    @property
     def has_dye(self) -> bool:
         """Whether some of it starts, or flows in, with a dye."""
-        return max(self.dyes) > 0.0
+        return any(each.dye > 0.0 for each in (*self.block, *self.emitter))
 
     @property
     def most_volume(self) -> float:
@@ -274,16 +259,14 @@ def shared_conflicts(fluids: Sequence[FluidParameters]) -> list[tuple[int, str, 
     return conflicts
 
 
-def dye_conflict(fluids: Sequence[FluidParameters]) -> tuple[int, str] | None:
+def tank_dye_conflict(fluids: Sequence[FluidParameters]) -> tuple[int, str] | None:
     """The first fluid of a tank whose dye can do nothing, and why."""
-    dyes: set[float] = set().union(*(fluid.dyes for fluid in fluids))
+    reason = dye_conflict(each for fluid in fluids for each in (*fluid.block, *fluid.emitter))
+    is_dyed = any(fluid.has_dye for fluid in fluids)
     for number, fluid in enumerate(fluids):
-        if len(dyes) == 1 and fluid.has_dye:
-            return number, (
-                f"has a dye of {max(dyes):g} everywhere, and nothing to mix with; give a block or an emitter another "
-                "one, or remove dye and name the color of its material"
-            )
-        if dyes == {0.0} and "dye_diffusivity" in fluid.model_fields_set:
+        if reason and fluid.has_dye:
+            return number, reason
+        if not is_dyed and "dye_diffusivity" in fluid.model_fields_set:
             return number, "dye_diffusivity has no meaning without dye; remove it or give a block or emitter a dye"
     return None
 

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import prod
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, PrivateAttr, model_validator
 
 from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
-from sim.core.parameters import BodyName, Fraction, KeyRefusedError, NonNegative, Positive, Vector3
+from sim.core.parameters import BodyName, Fraction, KeyRefusedError, NonNegative, Vector3
 from sim.rigid.break_parameters import BreakParameters
-from sim.rigid.group_parameters import CurveParameters, JitterParameters, ScatterParameters
+from sim.shapes.group_parameters import GroupedPlacement
 from sim.shapes.parameters import AnimationShape, PieceShape, WeightedPlacement
 
-MOST_OF_A_GROUP = 100_000
-PLACES = ("spacing", "along", "scatter")
-"""Keys of which a group has one: they say where its bodies are."""
 
-Count = Annotated[int, Field(ge=1, le=MOST_OF_A_GROUP)]
-
-
-class RigidBodyParameters(WeightedPlacement):
+class RigidBodyParameters(GroupedPlacement, WeightedPlacement):
     """A rigid body: fixed, moved along a path, or moved by forces and contacts; or a group of such bodies.
 
     A table with `count` is a group: its bodies share all other keys.
@@ -69,49 +62,6 @@ class RigidBodyParameters(WeightedPlacement):
         default=None, description="Pieces that the body breaks into; a dynamic body without it never breaks."
     )
 
-    # A group's keys are spent once its bodies are there, so that nothing of them is in what decides a frame.
-    count: Count | tuple[Count, Count, Count] | None = Field(
-        default=None,
-        exclude=True,
-        description="Makes a group of so many bodies [-], named NAME_1, NAME_2, ...: one number, or those along x, y "
-        "and z of a lattice, of which the first body is at the position. The rotation turns the lattice, too.",
-    )
-    spacing: Positive | Vector3 | None = Field(
-        default=None,
-        exclude=True,
-        description="Of a group: from one centre to the next [m], along x (one number, and one count), along x, y and "
-        "z of a lattice, or three numbers for one count: the way from each body to the next.",
-    )
-    offset: Vector3 = Field(
-        default=(0.0, 0.0, 0.0),
-        exclude=True,
-        description="How far every second storey of a lattice is shifted [m]: half a brick for a wall in bond.",
-    )
-    along: CurveParameters | None = Field(
-        default=None, exclude=True, description="Instead of spacing: a curve that the bodies of a group stand on."
-    )
-    scatter: ScatterParameters | None = Field(
-        default=None,
-        exclude=True,
-        description="Instead of spacing: a shape that the bodies of a group are scattered in, clear of each other and "
-        "of other scattered bodies.",
-    )
-    jitter: JitterParameters | None = Field(
-        default=None, exclude=True, description="How much the bodies of a group are out of line."
-    )
-    scales: tuple[Positive, Positive] | None = Field(
-        default=None,
-        exclude=True,
-        description="Smallest and largest size of the bodies of a group, times scale [-]: each has one of eight sizes "
-        "between, by chance.",
-    )
-    seed: int = Field(
-        default=0,
-        ge=0,
-        exclude=True,
-        description="Of a group: another number gives other places, turns and sizes where chance has a part in them.",
-    )
-    _table: int | None = PrivateAttr(default=None)
     _group: str | None = PrivateAttr(default=None)
     _model: str | None = PrivateAttr(default=None)
     _whole: str | None = PrivateAttr(default=None)
@@ -120,17 +70,6 @@ class RigidBodyParameters(WeightedPlacement):
     def whole(self) -> str | None:
         """Name of the body that it is a piece of."""
         return self._whole
-
-    @property
-    def is_placed(self) -> bool:
-        """Whether it is one of the bodies of a job, not a table that may make many."""
-        return self._table is not None
-
-    @property
-    def table(self) -> int:
-        """Which of the job's tables it comes from."""
-        assert self._table is not None, "the bodies of a job know their table"
-        return self._table
 
     @property
     def group(self) -> str:
@@ -147,23 +86,11 @@ class RigidBodyParameters(WeightedPlacement):
         """Whether its mesh is not that of another body."""
         return self.model == self.name
 
-    @property
-    def body_count(self) -> int:
-        """How many bodies the table makes."""
-        if self.count is None:
-            return 1
-        return self.count if isinstance(self.count, int) else prod(self.count)
-
-    def placed(self, table: int, *, model: str | None = None, **values: Any) -> Self:
+    def placed(self, table: int, *, member: int | None = None, model: str | None = None, **values: Any) -> Self:
         """A body of a table of this number, with other values; one of a group with the name of its model."""
-        body = self
+        body = super().placed(table, member=member, **values)
         if model is not None:
-            spent = ("count", "spacing", "along", "scatter", "jitter", "scales")
-            body = self.model_copy(update={**dict.fromkeys(spent), "offset": (0.0, 0.0, 0.0), "seed": 0, **values})
             body._group, body._model = self.group, model
-        else:
-            body = self.model_copy()
-        body._table = table
         return body
 
     def broken_down(self) -> Iterator[Self]:
@@ -211,6 +138,8 @@ class RigidBodyParameters(WeightedPlacement):
                 raise ValueError(f'{key} has no meaning for a static body; remove it or use kind = "kinematic"')
             if self.keyframe and any(getattr(self, key)):
                 raise ValueError(f"{key} of a body with keyframes comes from them; remove {key}")
+        if self.count is not None and self.keyframe:
+            raise KeyRefusedError(("keyframe",), "would lead all bodies of a group through one place; give velocity")
         if "interpolation" in given and not self.keyframe:
             raise ValueError("interpolation has no meaning without keyframes; remove it or add [[rigid.keyframe]]")
         require_ascending_times(self.keyframe)
@@ -229,29 +158,4 @@ class RigidBodyParameters(WeightedPlacement):
             raise KeyRefusedError(("keyframe",), "cannot lead a body that a file animates; move it there, or remove it")
         if self.count is not None:
             raise KeyRefusedError(("count",), "cannot be of a body that a file animates; write a table for each")
-        return self
-
-    @model_validator(mode="after")
-    def _has_one_way_to_be_many(self) -> Self:
-        given = self.model_fields_set
-        if self.count is None:
-            for key in (*PLACES, "offset", "jitter", "scales", "seed"):
-                if key in given:
-                    raise KeyRefusedError((key,), "has no meaning for one body; add count, or remove it")
-            return self
-        if self.keyframe:
-            raise KeyRefusedError(("keyframe",), "would lead all bodies of a group through one place; give velocity")
-        if self.body_count > MOST_OF_A_GROUP:
-            raise KeyRefusedError(("count",), f"is {self.body_count:,} bodies; a group has {MOST_OF_A_GROUP:,} at most")
-        ways = [key for key in PLACES if getattr(self, key) is not None]
-        if len(ways) != 1:
-            what = f"{' and '.join(ways)} place the bodies" if ways else "nothing places the bodies"
-            raise KeyRefusedError(("count",), f"{what}; give one of {', '.join(PLACES)}")
-        is_lattice = not isinstance(self.count, int)
-        if is_lattice and self.spacing is None:
-            raise KeyRefusedError(("count",), f"of a lattice needs spacing; with {ways[0]} give one number")
-        if "offset" in given and not is_lattice:
-            raise KeyRefusedError(("offset",), "shifts storeys of a lattice; give three counts, or remove it")
-        if self.scales is not None and self.scales[0] > self.scales[1]:
-            raise KeyRefusedError(("scales",), f"has the smallest size first, got {self.scales[0]:g} before the other")
         return self

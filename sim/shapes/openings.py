@@ -13,7 +13,8 @@ from sim.core.motion.parameters import (
     placed_at_first_keyframe,
     require_ascending_times,
 )
-from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
+from sim.shapes.filled_parameters import DYE
 from sim.shapes.inflow import Inflow
 from sim.shapes.parameters import Shape
 
@@ -67,6 +68,7 @@ class InflowParameters(Parameters):
     total_volume: Positive | None = Field(
         default=None, description="Volume after which it stops [m³], to a particle; 0.001 is a litre. None if omitted."
     )
+    dye: Fraction = Field(default=0.0, description=f"{DYE} of what flows in.")
     keyframe: tuple[KeyframeParameters, ...] = Field(
         default=(), description="Path of the opening; it rests before the first and after the last keyframe."
     )

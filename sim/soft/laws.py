@@ -32,8 +32,11 @@ APART = math.log(8.0)
 DENSE = 0.95
 """Density over that at rest from which on sand that was apart presses again [-]; below 1, as particles lie anyhow."""
 
-MOST_HARDENED, LEAST_HARDENED = 3.0, -2.0
-"""Exponents of snow's hardening at most and at least, exp(3) = 20 times as stiff: steps get shorter with its root."""
+MOST_CRUSHED = 0.56
+"""Part of its volume that snow lost for good up to which it gets harder: that of snow of 400 kg/m³ that became ice."""
+
+LEAST_HARDENED = -2.0
+"""Least exponent of snow's hardening, where it came apart."""
 
 
 @bundle
@@ -52,6 +55,7 @@ class Laws(NamedTuple):
     least: Floats  # SNOW: least and largest stretch [-]
     most: Floats
     hardening: Floats  # SNOW [-]
+    tearing: Floats  # SNOW: strain beyond its stretch in which cohesion decays to 1/e [-]; 0: it keeps it
 
 
 @ti.func
@@ -198,17 +202,19 @@ def stress_of_hencky(strain: Vector, mu: ti.f32, lam: ti.f32) -> Vector:
 @func
 def hardened(hardening: ti.f32, plastic: ti.f32) -> ti.f32:
     """Factor on the moduli of snow whose plastic Hencky strain of volume is given (Stomakhin et al. 2013, 6)."""
-    return ti.exp(ti.math.clamp(hardening * -expm1(plastic), LEAST_HARDENED, MOST_HARDENED))
+    return ti.exp(ti.max(hardening * ti.min(-expm1(plastic), MOST_CRUSHED), LEAST_HARDENED))
 
 
 @func
-def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
-    """What becomes of a trial strain e in a step of dt [s]: the elastic strain, the Kirchhoff stress [Pa], the history.
+def respond(trial: Matrix, b: ti.i32, history: ti.f32, cohesion: ti.f32, dt: ti.f32, laws: Laws):
+    """What becomes of a trial strain e in a step of dt [s]: elastic strain, Kirchhoff stress [Pa], history, cohesion.
 
-    The history is the Hencky strain of volume that sand in tension has gained, or that snow lost for good.
+    The history is the Hencky strain of volume that sand in tension has gained, or that snow lost for good. Cohesion is
+    the share of its critical stretch that snow still bears: a crack, smeared over a cell, takes as much energy in cells
+    of any size (Bazant & Oh 1983), and what is crushed denser than at rest sticks again.
     """
     law, mu, lam = laws.law[b], laws.mu[b], laws.lam[b]
-    e, stress, told = trial, Matrix(0.0), history
+    e, stress, told, left = trial, Matrix(0.0), history, cohesion
     gained = -1.0
     if law == ti.static(int(Law.SAND)):
         gained = volume_strain(trial) + history - laws.tip[b]
@@ -230,7 +236,12 @@ def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
             after = yielded_clay(strain, b, dt, laws)
         else:
             least, most = 0.5 * log1p(laws.least[b] ** 2 - 1.0), 0.5 * log1p(laws.most[b] ** 2 - 1.0)
+            if history < 0.0 and strain.min() < least:
+                left = 1.0
+            most *= left
             after = ti.min(ti.max(strain, least), most)
+            if laws.tearing[b] > 0.0:
+                left *= ti.exp(-ti.max(strain - most, 0.0).sum() / laws.tearing[b])
             told = history + (strain - after).sum()
         tau = stress_of_hencky(after, mu, lam)
         if law == ti.static(int(Law.SNOW)):
@@ -245,4 +256,4 @@ def respond(trial: Matrix, b: ti.i32, history: ti.f32, dt: ti.f32, laws: Laws):
             for k in ti.static(range(3)):
                 values[k] = expm1(2.0 * after[k])
             e = recomposed(axes, values)
-    return e, stress, told
+    return e, stress, told, left

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.core.parameters import BodyName, NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import BodyName, KeyRefusedError, NonNegative, Parameters, Positive
+from sim.shapes.filled_parameters import Blocks, dye_conflict
 from sim.shapes.openings import InflowParameters
-from sim.shapes.parameters import Placement
 from sim.soft.materials import LAW_KEYS, MATERIALS, MaterialRow
 
 PARTICLES_PER_CELL_EDGE = 2
@@ -20,14 +20,18 @@ WAVE_NUMBER = 0.5
 """Cells that a compression wave crosses in the largest stable step."""
 
 
-class SoftBlockParameters(Placement):
-    """A volume filled with soft matter at the start."""
-
-    velocity: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Initial velocity [m/s].")
-
-
 class SoftEmitterParameters(InflowParameters):
     """An opening from which soft matter is poured, without stress; end_s or total_volume says how much in all."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _follows_nobody(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "follow" in data:
+            raise KeyRefusedError(
+                ("follow",),
+                "is for emitters of fluids: all that soft matter pours is known before the first frame; use keyframes",
+            )
+        return data
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
@@ -40,12 +44,12 @@ class SoftParameters(Parameters):
     """A body of soft matter: what it is made of, how finely it is computed, and where it is and comes in."""
 
     name: BodyName = Field(description="Name of the body, unique in the job.")
-    material: Literal["sand", "wet_sand", "snow", "jelly", "rubber", "clay", "dough", "cream"] = Field(
+    material: Literal["sand", "wet_sand", "snow", "packed_snow", "jelly", "rubber", "clay", "dough", "cream"] = Field(
         description="What it is made of, which gives the keys below that are omitted: "
         + "; ".join(f"{name}: {row.about}" for name, row in MATERIALS.items())
         + "."
     )
-    block: tuple[SoftBlockParameters, ...] = Field(default=(), description="Volumes filled at the start.")
+    block: Blocks = Field(default=(), description="Volumes filled at the start.")
     emitter: tuple[SoftEmitterParameters, ...] = Field(default=(), description="Openings from which it is poured.")
     cell_size: Positive = Field(
         default=0.02, description="Edge of the grid's cells [m], with eight particles each; one for all soft bodies."
@@ -85,6 +89,11 @@ class SoftParameters(Parameters):
     hardening: NonNegative | None = Field(
         default=None, description="Exponent by which it gets harder where it is crushed [-]; of snow."
     )
+    fracture_energy: Positive | None = Field(
+        default=None,
+        description="Energy that tears it apart, for the area of a crack [J/m²], whatever the cells; what is torn has "
+        "no cohesion until it is crushed. Without it, it flows instead of tearing; of snow.",
+    )
     friction: NonNegative = Field(
         default=0.5,
         description="Friction against walls and bodies [-], one for all soft bodies; with a body that of the pair is "
@@ -101,6 +110,8 @@ class SoftParameters(Parameters):
     def _is_somewhere(self) -> Self:
         if not self.block and not self.emitter:
             raise ValueError("has neither a block nor an emitter; add [[soft.block]] or [[soft.emitter]]")
+        if conflict := dye_conflict((*self.block, *self.emitter)):
+            raise ValueError(conflict)
         return self
 
     @model_validator(mode="after")
@@ -116,6 +127,11 @@ class SoftParameters(Parameters):
         if self.flow_exponent is not None and self.value("viscosity") == 0.0:
             raise ValueError("flow_exponent has no meaning without viscosity; add one, or remove it")
         return self
+
+    @property
+    def has_dye(self) -> bool:
+        """Whether some of it starts, or is poured, with a dye."""
+        return any(each.dye > 0.0 for each in (*self.block, *self.emitter))
 
     @property
     def row(self) -> MaterialRow:

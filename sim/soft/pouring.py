@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import taichi as ti
@@ -24,6 +24,7 @@ class Poured:
     velocity: NDArray[np.float32]  # [m/s], (n, 3)
     time_s: NDArray[np.float64]  # when, ascending [s], (n,)
     body: NDArray[np.int32]  # of which each is a part, (n,)
+    dye: NDArray[np.float32]  # concentration in it [-], (n,)
 
     @property
     def largest_speed(self) -> float:
@@ -32,21 +33,22 @@ class Poured:
 
     @classmethod
     def of_layer(
-        cls, position: NDArray[np.floating], velocity: NDArray[np.floating], time_s: float, body: int
+        cls, position: NDArray[np.floating], velocity: NDArray[np.floating], time_s: float, body: int, dye: float
     ) -> Poured:
-        """Particles of one body that come at one time, (m, 3) each."""
+        """Particles of one body and dye that come at one time, (m, 3) each."""
         count = len(position)
-        numbers = np.full(count, time_s), np.full(count, body, np.int32)
+        numbers = np.full(count, time_s), np.full(count, body, np.int32), np.full(count, dye, np.float32)
         return cls(position.astype(np.float32), velocity.astype(np.float32), *numbers)
 
     @classmethod
     def together(cls, layers: Sequence[Poured]) -> Poured:
         """Those of all layers."""
-        none = cls.of_layer(np.empty((0, 3)), np.empty((0, 3)), 0.0, 0)
-        arrays = zip(*((each.position, each.velocity, each.time_s, each.body) for each in (none, *layers)), strict=True)
-        position, velocity, time_s, body = map(np.concatenate, arrays)
-        order = np.argsort(time_s, kind="stable")
-        return cls(position[order], velocity[order], time_s[order], body[order])
+        none = cls.of_layer(np.empty((0, 3)), np.empty((0, 3)), 0.0, 0, 0.0)
+        rows = {
+            each.name: np.concatenate([getattr(layer, each.name) for layer in (none, *layers)]) for each in fields(cls)
+        }
+        order = np.argsort(rows["time_s"], kind="stable")
+        return cls(**{name: values[order] for name, values in rows.items()})
 
 
 class Pouring:

@@ -51,7 +51,7 @@ SOLVER_NAME = "soft"
 
 MOTION_NUMBER = 0.3  # cells that a particle crosses in it
 
-STATE = ("position", "velocity", "affine", "strain", "stress", "history", "body")
+STATE = ("position", "velocity", "affine", "strain", "stress", "history", "cohesion", "body")
 """Arrays that a checkpoint has."""
 
 TINY_SPEED = 1.0e-12  # of what does not move at all [m/s]
@@ -103,9 +103,10 @@ class SoftSolver:
         if conflicts := shared_conflicts(self.parameters):
             number, key, message = conflicts[0]
             raise ValueError(f'soft "{self.parameters[number].name}": {key} {message}')
-        position, velocity, body, volume = _filled(self.parameters, domain, solids)
+        position, velocity, body, dye, volume = _filled(self.parameters, domain, solids)
         self.poured = poured or Poured.together([])
         self.owner = np.concatenate([body, self.poured.body])
+        self._dye = np.concatenate([dye, self.poured.dye])
         self._pouring = Pouring(self.poured, len(position)) if len(self.poured.body) else None
         rows = zip((position, velocity, body), waiting_rows(self.poured), strict=True)
         position, velocity, body = (np.concatenate(each) for each in rows)
@@ -117,7 +118,10 @@ class SoftSolver:
         is_sand = np.array([each.row.law == Law.SAND for each in self.parameters])
         self._has_sand = bool(is_sand.any())
         history = on_device(np.where((body < 0) & is_sand[self.owner], np.float32(APART), np.float32(0.0)))
-        self.particles = Particles(on_device(position), on_device(velocity), *rows_of, history, on_device(body), n)
+        has_snow = any(each.row.law == Law.SNOW for each in self.parameters)
+        cohesion = on_device(np.ones(n if has_snow else 1, np.float32))
+        rows = on_device(position), on_device(velocity), *rows_of, history, cohesion, on_device(body)
+        self.particles = Particles(*rows, n)
         self.spacing = self.parameters[0].spacing
         self.masses, self.volume = on_device(particle_mass), volume
         self._load_particles(0)
@@ -262,18 +266,14 @@ class SoftSolver:
         body, position, velocity = (
             copied(array) for array in (self.particles.body, self.particles.position, self.particles.velocity)
         )
-        return {
-            each.name: Snapshot(
-                "soft",
-                {
-                    "position": position[body == number],
-                    "velocity": velocity[body == number],
-                    "particle_id": np.flatnonzero(body == number).astype(np.int32),
-                },
-                {"radius": 0.5 * each.spacing, "material": each.material},
-            )
-            for number, each in enumerate(self.parameters)
-        }
+        found = {}
+        for number, each in enumerate(self.parameters):
+            rows = np.flatnonzero(body == number)
+            arrays = {"position": position[rows], "velocity": velocity[rows], "particle_id": rows.astype(np.int32)}
+            if each.has_dye:
+                arrays["dye"] = self._dye[rows]
+            found[each.name] = Snapshot("soft", arrays, {"radius": 0.5 * each.spacing, "material": each.material})
+        return found
 
     def view(self, body: str) -> dict[str, NDArray[np.generic]]:
         """Positions [m] and velocities [m/s] of a body's particles, (n, 3) each."""
@@ -346,11 +346,11 @@ class SoftSolver:
 
 def _filled(
     parameters: Sequence[SoftParameters], domain: DomainParameters, solids: Sequence[Solid]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], float]:
-    """Positions [m], velocities [m/s] and bodies of the particles that fill all blocks, and the volume of each [m³]."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.float32], float]:
+    """Positions [m], velocities [m/s], bodies and dye [-] of particles in all blocks, and the volume of each [m³]."""
     spacing = parameters[0].spacing
     positions, velocities = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
-    bodies = [np.empty(0, np.int32)]
+    bodies, dyes = [np.empty(0, np.int32)], [np.empty(0, np.float32)]
     filled: list[Solid] = []
     for index, soft in enumerate(parameters):
         for number, block in enumerate(soft.block):
@@ -366,7 +366,9 @@ def _filled(
             positions.append(sorted_by_cell(points, domain, parameters[0].cell_size))
             velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
             bodies.append(np.full(len(points), index, dtype=np.int32))
-    return np.concatenate(positions), np.concatenate(velocities), np.concatenate(bodies), spacing**3
+            dyes.append(np.full(len(points), block.dye, dtype=np.float32))
+    rows = (np.concatenate(each) for each in (positions, velocities, bodies, dyes))
+    return (*rows, spacing**3)
 
 
 def laws_of(parameters: Sequence[SoftParameters]) -> Laws:
@@ -383,6 +385,8 @@ def laws_of(parameters: Sequence[SoftParameters]) -> Laws:
         power = 1.0 / (each.value("flow_exponent") or 1.0)
         flowing = 2.0 ** (0.5 - 0.5 * power) * (each.value("viscosity") / mu) ** power
         dense, hardening = DENSE * each.value("density"), each.value("hardening")
-        rows.append((dense, mu, lam, slope, tip, yielding, flowing, power, least, most, hardening))
+        tensile = each.value("young_modulus") * each.value("critical_stretch")
+        tearing = each.value("fracture_energy") / (tensile * each.cell_size) if tensile > 0.0 else 0.0
+        rows.append((dense, mu, lam, slope, tip, yielding, flowing, power, least, most, hardening, tearing))
     law = np.array([int(each.row.law) for each in parameters], dtype=np.int32)
     return Laws(on_device(law), *(on_device(np.array(column)) for column in zip(*rows, strict=True)))

@@ -54,6 +54,7 @@ class Particles(NamedTuple):
     strain: Floats  # elastic b - 1 [-], (6 n,)
     stress: Floats  # Kirchhoff [Pa], (6 n,)
     history: Floats  # of the law [-]
+    cohesion: Floats  # that is left of snow's [-]; one number where there is no snow
     body: Integers
     count: ti.i32
 
@@ -279,7 +280,12 @@ def grid_to_particles(
                 hidden = parting.hidden[p]
             is_dense = density_around(hidden, block, inside, blocks, nodes) > laws.dense[b]
             history = ti.select(is_dense, 0.0, 2.0 * APART)  # no step takes back as much
-        strain, stress, history = respond(trial, b, history, dt, laws)
+        cohesion = 1.0
+        if laws.law[b] == ti.static(int(Law.SNOW)):
+            cohesion = particles.cohesion[p]
+        strain, stress, history, cohesion = respond(trial, b, history, cohesion, dt, laws)
+        if laws.law[b] == ti.static(int(Law.SNOW)):
+            particles.cohesion[p] = cohesion
         particles.velocity[p] = velocity
         for i, j in ti.static(ti.ndrange(3, 3)):
             particles.affine[(3 * i + j) * particles.count + p] = affine[i, j]

@@ -6,13 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import draw_all, spec_of, sphere
+from blender_scenes import PIXELS_PER_METRE, RESOLUTION, draw_all, spec_of, sphere
 from needed_blender import needs_bpy
 
 from render.dye import dye_at
+from render.grains import grains_of
 from render.meshes import read_ply, write_ply
 from render.parameters import MaterialParameters
-from render.spec import MeshSequenceObject
+from render.point_clouds import write_point_cloud
+from render.spec import MeshSequenceObject, PointSequenceObject
 
 RADIUS = 0.005
 
@@ -71,3 +73,32 @@ def test_a_liquid_has_the_colour_of_its_dye_and_colours_mix_between(tmp_path):
     assert ratio[2] < 0.6
     red = dyed[rows, columns[2]].mean(axis=(0, 1))
     assert red[0] > 1.5 * max(red[1:])
+
+
+@needs_bpy
+def test_clay_jelly_and_grains_of_sand_have_the_colour_of_their_dye(tmp_path):
+    """Pairs of balls, of which the second has dye all through, under one material each."""
+    looks, places, radius = ("stone", "jelly", "sand"), (-0.75, -0.45, -0.15, 0.15, 0.45, 0.75), 0.14
+    objects = []
+    for number, x in enumerate(places):
+        look, dye = looks[number // 2], float(number % 2)
+        material = MaterialParameters(look=look, color=(0.6, 0.6, 0.6), dye_color=(0.7, 0.02, 0.02))
+        name = f"ball{number}"
+        given = {"name": name, "file": f"{name}/{{frame}}.ply", "material": material}
+        (tmp_path / name).mkdir()
+        positions, triangles = sphere((x, 0.0, 0.5), radius)
+        if look == "sand":
+            cloud = grains_of(
+                positions, 0 * positions, np.arange(len(positions)), np.full(len(positions), dye), radius=0.015
+            )
+            write_point_cloud(tmp_path / name / "000000.ply", cloud)
+            objects.append(PointSequenceObject(kind="spray", **given))
+        else:
+            write_ply(tmp_path / name / "000000.ply", positions, triangles, dye=np.full((len(positions), 1), dye))
+            objects.append(MeshSequenceObject(**given))
+    (picture,) = draw_all(tmp_path, spec_of(*objects, samples=16, motion_blur=False))
+    columns = [round(RESOLUTION[0] / 2 + x * PIXELS_PER_METRE) for x in places]
+    redness = [picture[16:20, at - 2 : at + 2].mean(axis=(0, 1)) for at in columns]
+    without, dyed = (np.array([red / green for red, green, _ in redness[first::2]]) for first in (0, 1))
+    assert (without < 1.3).all(), without
+    assert (dyed > 2.0 * without).all(), (dyed, without)

@@ -22,3 +22,9 @@ def test_grains_fill_their_share_and_stay_with_their_particle():
     half = grains_of(position[::2], velocity[::2], ids[::2], radius=radius)
     np.testing.assert_array_equal(half.position, cloud.position.reshape(n, -1, 3)[::2].reshape(-1, 3))
     np.testing.assert_array_equal(half.radius, cloud.radius.reshape(n, -1)[::2].ravel())
+
+
+def test_grains_have_the_dye_of_their_particle():
+    position, dye = np.zeros((3, 3)), np.array([0.0, 0.5, 1.0], np.float32)
+    cloud = grains_of(position, position, np.arange(3), dye, radius=0.005)
+    np.testing.assert_array_equal(cloud.dye, np.repeat(dye, GRAINS_A_PARTICLE))

@@ -4,7 +4,6 @@ from math import log2
 from pathlib import Path
 
 from blender_scripts.look_table import LOOK_TABLE, MATERIAL_KEYS, looks_for
-from blender_scripts.optics import INSIDES
 from pipeline.job.checks.camera import check_camera
 from pipeline.job.checks.optical_depth import check_optical_depths
 from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_set
@@ -119,29 +118,31 @@ def _check_materials(job: Job, findings: Findings) -> None:
 
 def _check_dye(job: Job, findings: Findings) -> None:
     """Warn of dye that no picture shows, and of the colour of a dye that is not there."""
-    dyed = {fluid.name for fluid in job.fluid if fluid.has_dye}
-    reached = {fluid.name for fluid in job.fluid} if dyed else set()  # it goes from one fluid of a tank into the others
-    showing = [name for name in INSIDES if "dye_color" in LOOK_TABLE[name].keys]
-    for index, fluid in enumerate(job.fluid):
-        material = described_material(job, fluid.name)
-        if fluid.name not in dyed or material.look is None:
+    dyed = {body.name for mixing in (job.fluid, job.soft) for body in mixing if body.has_dye}
+    fluids = {fluid.name for fluid in job.fluid}
+    reached = dyed | (fluids if dyed & fluids else set())  # it goes from one fluid of a tank into the others
+    rows = {name: LOOK_TABLE[name] for name in looks_for("fluid")}
+    showing = [name for name, row in rows.items() if "dye_color" in row.keys and not row.lets_light_by]
+    for path, _, body in bodies(job):
+        material = described_material(job, body.name)
+        if body.name not in dyed or material.look is None:
             continue
         if material.look not in showing:
             findings.warn(
-                ("fluid", index),
+                path,
                 f'has dye, and its look "{material.look}" does not show it; use {quoted_list(showing)}, or read it '
                 "from the frames",
             )
         elif material.dye_color is None:
-            findings.warn(
-                ("fluid", index), f"has dye, and no picture shows it; add dye_color to [material.{fluid.name}]"
-            )
+            findings.warn(path, f"has dye, and no picture shows it; add dye_color to [material.{body.name}]")
     for written, said in job.material.items():
-        meant = [body.name for _, _, body in bodies(job) if is_meant(written, body.name)]
+        meant = {body.name: path[0] for path, _, body in bodies(job) if is_meant(written, body.name)}
         if said.dye_color is not None and meant and not reached & set(meant):
+            name, kind = next(iter(meant.items()))
+            remedy = f"give a [[{kind}.block]] or [[{kind}.emitter]] of it a dye"
             findings.warn(
                 ("material", written, "dye_color"),
-                f'has no effect, as "{meant[0]}" has no dye; give a [[fluid.block]] or [[fluid.emitter]] of it a dye',
+                f'has no effect, as "{name}" has no dye; {remedy if kind in ("fluid", "soft") else "remove it"}',
             )
 
 

@@ -245,3 +245,27 @@ def test_jobs_made_in_python_have_groups():
     }
     job = make_job(name="row", frames=2, rigid=[bricks]).job
     assert [body.name for body in job.rigid] == ["brick_1", "brick_2", "brick_3"]
+
+
+SNOWBALLS = """
+[[soft]]
+name = "snow"
+material = "snow"
+cell_size = 0.01
+[[soft.block]]
+shape = { type = "sphere", radius = 0.03 }
+position = [-0.8, 0.0, 0.1]
+[[soft.block]]
+shape = { type = "sphere", radius = 0.03 }
+position = [0.0, 0.0, 0.1]
+count = 8
+spacing = 0.2
+"""
+
+
+def test_what_is_told_of_many_blocks_stands_at_their_table_and_says_which(tmp_path):
+    found = check(tmp_path, ROOM + SNOWBALLS).errors
+    # From the seventh on, at x = 1.2 m, they are outside of the domain.
+    assert [line.split(" has no particle")[0] for line in found] == [
+        f"many.toml:15 soft[0].block[1]: block {number} of the group" for number in (7, 8)
+    ]

@@ -73,3 +73,5 @@ def test_openings_that_are_too_narrow_or_without_an_end_are_refused():
         world_of(SPOUT | FLOW | {"shape": {"type": "disc", "radius": 0.003}})
     with pytest.raises(ValidationError, match="has neither end_s nor total_volume"):
         world_of(SPOUT | {"speed": 1.0})
+    with pytest.raises(ValidationError, match="is for emitters of fluids"):
+        world_of(SPOUT | FLOW | {"follow": "cart"})

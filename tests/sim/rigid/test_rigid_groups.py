@@ -13,10 +13,11 @@ from rigid_scenes import ball, body, cube
 
 from sim.core.motion.rotation import from_degrees, rotated
 from sim.core.parameters import KeyRefusedError
-from sim.rigid.groups import SIZES, with_groups
+from sim.rigid.groups import with_groups
 from sim.rigid.parameters import RigidBodyParameters
 from sim.scene import SceneParameters
 from sim.shapes.extent import ball_around, box_around, depth_inside
+from sim.shapes.groups import SIZES
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
 

@@ -18,10 +18,19 @@ BLOCK = ({"shape": {"type": "sphere", "radius": 0.1}},)
 
 
 @kernel
-def answer(trial: Matrices, history: Floats, dt: ti.f32, laws: Laws, strain: Matrices, stress: Matrices, told: Floats):
+def answer(
+    trial: Matrices,
+    history: Floats,
+    cohesion: Floats,
+    dt: ti.f32,
+    laws: Laws,
+    strain: Matrices,
+    stress: Matrices,
+    told: Floats,
+):
     for k in range(trial.shape[0]):
-        e, tau, after = respond(trial[k], 0, history[k], dt, laws)
-        strain[k], stress[k], told[k] = e, tau, after
+        e, tau, after, left = respond(trial[k], 0, history[k], cohesion[k], dt, laws)
+        strain[k], stress[k], told[k], cohesion[k] = e, tau, after, left
 
 
 @kernel
@@ -55,12 +64,14 @@ def floats(values):
     return array
 
 
-def answered(body, trials, history=0.0, dt=1.0e-4):
-    """Elastic strain e, Kirchhoff stress and history of trial strains, in float64."""
+def answered(body, trials, history=0.0, dt=1.0e-4, cohesion=None):
+    """Elastic strain e, Kirchhoff stress and history of trial strains, in float64; `cohesion` becomes what is left."""
     n = len(trials)
-    before = floats(np.full(n, history))
+    before, left = floats(np.full(n, history)), floats(np.ones(n) if cohesion is None else cohesion)
     out = matrices(np.zeros((n, 3, 3))), matrices(np.zeros((n, 3, 3))), floats(np.zeros(n))
-    answer(matrices(trials), before, dt, laws_of([body]), *out)
+    answer(matrices(trials), before, left, dt, laws_of([body]), *out)
+    if cohesion is not None:
+        cohesion[:] = left.to_numpy()
     return tuple(each.to_numpy().astype(np.float64) for each in out)
 
 
@@ -231,3 +242,32 @@ def test_snow_breaks_beyond_its_stretches_and_is_harder_once_crushed():
     _, (fresh,), _ = answered(body, [same])
     _, (crushed,), _ = answered(body, [same], history=-0.05)
     np.testing.assert_allclose(crushed / fresh, math.exp(-10.0 * math.expm1(-0.05)), rtol=1e-3)
+    # It gets harder as far as it can be crushed: snow of 400 kg/m³ is ice once 0.44 of its volume are left.
+    _, (ice,), _ = answered(body, [same], history=math.log(0.44))
+    np.testing.assert_allclose(ice / fresh, math.exp(5.6), rtol=1e-3)
+
+
+def test_packed_snow_loses_its_cohesion_over_a_crack_and_gets_it_back_where_it_is_crushed():
+    body, (turn,) = soft("packed_snow", cell_size=0.02, fracture_energy=2.0), random_turns(1)
+    wide = 2.0 / (1.4e6 * 7.5e-3 * 0.02)  # a strain over a cell that takes as much at the strength
+    stretched = math.log(1.0075) + 0.5 * wide
+    trial = strains_of([stretched, 0.0, 0.0], turn)
+    left = np.ones(1)
+    answered(body, [trial], cohesion=left)
+    np.testing.assert_allclose(left, math.exp(-0.5), rtol=1e-3)
+    # It bears so much less in the next step, and nothing in the end; pulled as far, snow that is not packed keeps all.
+    strain, _, _ = answered(body, [trial], cohesion=left.copy())
+    assert 0.5 * np.log1p(np.linalg.eigvalsh(strain[0])[-1]) == pytest.approx(
+        math.exp(-0.5) * math.log(1.0075), rel=1e-3
+    )
+    for _ in range(20):
+        answered(body, [trial], cohesion=left)
+    assert left < 1e-4
+    crushed = strains_of([-0.05, 0.0, 0.0], turn)
+    for history, expected in ((0.1, left[0]), (-0.1, 1.0)):
+        again = left.copy()
+        answered(body, [crushed], history=history, cohesion=again)
+        np.testing.assert_allclose(again, expected)
+    kept = np.ones(1)
+    answered(soft("snow"), [trial], cohesion=kept)
+    assert kept == 1.0

@@ -4,6 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from thread_counts import digest_of, result_on_threads
 
 from sim.core.domain import DomainParameters
@@ -236,3 +239,41 @@ def test_blocks_that_are_kept_while_particles_go_half_a_cell_give_the_bits_of_bl
     assert 1 < few < 20 and many == 40
     for name, array in kept.items():
         np.testing.assert_array_equal(array, anew[name], err_msg=name)
+
+
+def test_a_snowball_at_20_metres_a_second_is_crushed_to_the_density_of_firn_not_beyond_ice():
+    """Crushing takes E theta/xi (exp(xi (1 - J)) - 1) a volume, 80 kJ/m³ at J = 0.46; cells at the front get more."""
+    ball = {"shape": {"type": "sphere", "radius": 0.04}, "position": (0.0, 0.0, -0.45), "velocity": (0.0, 0.0, -20.0)}
+    body = SoftParameters(name="it", material="snow", cell_size=0.01, block=(ball,))
+    solver = SoftSolver([body], domain=DOMAIN, gravity=FREE)
+    advance(solver, 0.012)
+    density = 400.0 * np.exp(-solver.particles.history.to_numpy())
+    assert 600.0 < np.median(density) < 800.0
+    assert np.quantile(density, 0.95) < 917.0
+    assert solver.view("it")["velocity"][:, 2].mean() > 0.0
+
+
+def largest_part(solver):
+    """Share of the particles in the largest part of them that gaps of more than a cell set apart."""
+    position = solver.view("it")["position"]
+    near = cKDTree(position).query_pairs(solver.parameters[0].cell_size, output_type="ndarray")
+    n = len(position)
+    _, part = connected_components(coo_matrix((np.ones(len(near)), near.T), (n, n)), directed=False)
+    return np.bincount(part).max() / n
+
+
+@pytest.mark.parametrize(("speed", "whole"), [(1.0, True), (12.0, False)])
+def test_a_ball_of_packed_snow_bursts_where_it_hits_and_stays_whole_where_it_drops(speed, whole):
+    """15 cm, onto a floor: from a height of 5 cm it keeps its cohesion, thrown it leaves no half together."""
+    radius, cell = 0.075, 0.075 / 4.0
+    ball = {"shape": {"type": "sphere", "radius": radius}, "position": (0, 0, radius - 0.5), "velocity": (0, 0, -speed)}
+    body = SoftParameters(name="it", material="packed_snow", cell_size=cell, block=(ball,))
+    solver = SoftSolver([body], domain=DOMAIN, gravity=(0.0, 0.0, -GRAVITY))
+    advance(solver, 0.06)
+    cohesive = (solver.particles.cohesion.to_numpy() > 0.5).mean()
+    if whole:
+        assert largest_part(solver) == 1.0
+        assert cohesive > 0.8
+    else:
+        assert largest_part(solver) < 0.5
+        assert cohesive < 0.5

@@ -194,8 +194,8 @@ DYED = (
     ("text", "expected"),
     [
         (
-            DYED + '[material.water]\nlook = "rubber"\n',
-            'fluid[0]: has dye, and its look "rubber" does not show it ... "juice" or "muddy_water"',
+            DYED + '[material.water]\nlook = "metal"\n',
+            'fluid[0]: has dye, and its look "metal" does not show it ... "muddy_water", "rubber" ... or "jelly"',
         ),
         (DYED, "fluid[0]: has dye ... add dye_color to [material.water]"),
         (DYED + '[material.water]\nlook = "milk"\n', "fluid[0]: has dye ... add dye_color to [material.water]"),
