@@ -28,7 +28,7 @@ from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_floats
 from sim.smoke.cut_cells import CHANGES, NEAR_SOLIDS
 from sim.smoke.free_bodies import Carried, FreeBodies, flux_of_answer
-from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start
+from sim.smoke.lanes import Grid, clear_ghosts, fill_row, lane_items, lane_place, row_start
 from sim.smoke.multigrid import Equation, MultigridVCycle, laplacian
 from sim.smoke.obstacles import Obstacles, Solids, flux_part, mean_volume, wall_flux
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up, with_nodes_of_its_own
@@ -160,10 +160,10 @@ class PressureProjection:
         return largest, speed, mean
 
     def _clear_work(self) -> None:
-        """Ghosts must hold 0, whatever others kept in these arrays."""
-        for array in self.work:
-            if array is not self._search.image:
-                array.fill(0.0)
+        """Ghosts must hold 0, whatever others kept in these arrays; those of coarser levels nobody else has."""
+        equation, search = self._search.equation, self._search
+        clear_ghosts(self._box, Faces(search.correction, search.direction, search.image))
+        clear_ghosts(self._box, Faces(equation.right_hand_side, equation.solution, equation.spare))
 
 
 @kernel
