@@ -90,7 +90,7 @@ def _compute_confinement(box: Grid, omega: Faces, magnitude: Floats, half_per_ce
             eta_y = half_per_cell * (magnitude[at + box.step_y] - magnitude[at - box.step_y])
             eta_z = half_per_cell * (magnitude[at + 1] - magnitude[at - 1])
             length = ti.sqrt(eta_x * eta_x + eta_y * eta_y + eta_z * eta_z)
-            # Vorticity is that of the cells in `_compute_vorticity`; beside the sides there is anything.
+            # Beside the sides the arrays hold what others left there.
             is_inner, scale = inner_row and 2 < k < box.nz - 1, strength / (length + TINY_GRADIENT)
             omega_x, omega_y, omega_z = omega.x[at], omega.y[at], omega.z[at]
             omega.x[at] = ti.select(is_inner, scale * (eta_y * omega_z - eta_z * omega_y), 0.0)

@@ -210,7 +210,7 @@ def test_a_flat_box_on_a_gpu_counts_the_lanes_of_its_rows():
         check_smokes(job.model_copy(update={"smoke": (smoke,)}), {}, budget, findings)
         return [problem.message for problem in findings.errors]
 
-    # 100 x 100 x 4 cells of 250 bytes are 10 MB, and of 378 on a CPU 15.12; 10,000 rows with 32 lanes of 8 bytes in five
+    # 100 x 100 x 4 cells of 250 bytes are 10 MB, of 378 on a CPU 15.12; 10,000 rows with 32 lanes of 8 bytes in five
     # reductions are 12.8 MB.
     assert errors(0.01, on_gpu=False) == []
     (error,) = errors(0.01, on_gpu=True)
