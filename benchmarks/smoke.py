@@ -54,12 +54,12 @@ DEVELOPED_S = 0.7
 
 FPS = 60
 WIND, FRAME_S = (1.0, 0.0, 0.0), 1.0 / 24.0
-BALL = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.15}, "position": (0.0, 0.0, 0.6)}
+BALL = {"name": "ball", "kind": "dynamic", "density": 100.0, "shape": {"type": "sphere", "radius": 0.15}}
 WATER = {"shape": {"type": "box", "size": (0.3, 0.3, 0.2)}, "position": (0.3, 0.3, 0.1)}
 FLAG = {"name": "flag", "shape": {"type": "rectangle", "size": (0.2, 0.2), "counts": (17, 17)}}
 COMPANY: dict[str, dict[str, Any]] = {
     "gusts": {},
-    "ball": {"rigid": [{**BALL, "velocity": (0.1, 0.0, 0.0)}]},
+    "ball": {"rigid": [{**BALL, "position": (0.0, 0.0, 0.6), "velocity": (0.1, 0.0, 0.0)}]},
     "fluid": {"fluid": [{"name": "water", "particle_radius": 0.02, "block": [WATER]}]},
     "cloth": {"cloth": [{**FLAG, "position": (-0.3, 0.0, 0.5)}]},
 }

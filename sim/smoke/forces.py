@@ -9,7 +9,7 @@ from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.smoke.arrays import Faces
-from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start, steps
+from sim.smoke.lanes import Grid, clear_ghosts, fill_row, lane_items, lane_place, row_start, steps
 from sim.smoke.obstacles import Air, flux_part
 from sim.smoke.parameters import SmokeParameters
 
@@ -34,10 +34,12 @@ def accelerate(
     arrays to work in.
     """
     confinement, vorticity = Faces(*work[:3]), work[3]
-    for values in (*confinement, vorticity):
-        values.fill(0.0)
     strength, half_per_cell = parameters.vorticity_confinement * parameters.cell_size, 0.5 / parameters.cell_size
-    if strength > 0.0:
+    if strength == 0.0:
+        for values in confinement:
+            values.fill(0.0)
+    else:
+        clear_ghosts(air.box, confinement)
         _compute_vorticity(air.box, air.state.velocity, confinement, vorticity, half_per_cell)
         _compute_confinement(air.box, confinement, vorticity, half_per_cell, strength)
     x, y, z = upward(gravity)
@@ -88,11 +90,12 @@ def _compute_confinement(box: Grid, omega: Faces, magnitude: Floats, half_per_ce
             eta_y = half_per_cell * (magnitude[at + box.step_y] - magnitude[at - box.step_y])
             eta_z = half_per_cell * (magnitude[at + 1] - magnitude[at - 1])
             length = ti.sqrt(eta_x * eta_x + eta_y * eta_y + eta_z * eta_z)
-            scale = ti.select(inner_row and 2 < k < box.nz - 1, strength / (length + TINY_GRADIENT), 0.0)
+            # Beside the sides the arrays hold what others left there.
+            is_inner, scale = inner_row and 2 < k < box.nz - 1, strength / (length + TINY_GRADIENT)
             omega_x, omega_y, omega_z = omega.x[at], omega.y[at], omega.z[at]
-            omega.x[at] = scale * (eta_y * omega_z - eta_z * omega_y)
-            omega.y[at] = scale * (eta_z * omega_x - eta_x * omega_z)
-            omega.z[at] = scale * (eta_x * omega_y - eta_y * omega_x)
+            omega.x[at] = ti.select(is_inner, scale * (eta_y * omega_z - eta_z * omega_y), 0.0)
+            omega.y[at] = ti.select(is_inner, scale * (eta_z * omega_x - eta_x * omega_z), 0.0)
+            omega.z[at] = ti.select(is_inner, scale * (eta_x * omega_y - eta_y * omega_x), 0.0)
 
 
 @kernel

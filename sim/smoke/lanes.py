@@ -21,7 +21,9 @@ import taichi as ti
 
 from sim.core.arrays import Floats
 from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
 from sim.core.reductions import runs_on_gpu
+from sim.smoke.arrays import Faces
 
 GPU_LANES = 32  # as many as the threads of a GPU that run in step: together they read whole lines of memory
 RUN = 16  # cells of a run: two vectors of eight, few enough that short rows have some
@@ -146,3 +148,18 @@ def fill_rows(
         found = compute(k, *given)
         for c in ti.static(range(count)):
             outs[c][row + k] = found[c]
+
+
+@kernel
+def clear_ghosts(box: Grid, values: Faces):
+    """Set the layer around the cells to 0 in three arrays."""
+    for i, j, lane in ti.ndrange(box.nx + 2, box.ny + 2, box.lanes):
+        # Of rows of cells only both ends are ghosts.
+        count, step = box.nz + 2, 1
+        if 1 <= i <= box.nx and 1 <= j <= box.ny:
+            count, step = 2, box.nz + 1
+        for n in range(lane_items(box, count, lane)):
+            at = row_start(box, i, j) + (lane_place(box, n, lane) - 1) * step
+            values.x[at] = 0.0
+            values.y[at] = 0.0
+            values.z[at] = 0.0

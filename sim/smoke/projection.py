@@ -28,10 +28,10 @@ from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_floats
 from sim.smoke.cut_cells import CHANGES, NEAR_SOLIDS
 from sim.smoke.free_bodies import Carried, FreeBodies, flux_of_answer
-from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start
+from sim.smoke.lanes import Grid, clear_ghosts, fill_row, lane_items, lane_place, row_start
 from sim.smoke.multigrid import Equation, MultigridVCycle, laplacian
 from sim.smoke.obstacles import Obstacles, Solids, flux_part, mean_volume, wall_flux
-from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up
+from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up, with_nodes_of_its_own
 from sim.smoke.regions import ClosedRegions
 
 SAFETY = 0.7  # the recursion aims below the tolerance, as correcting the velocity adds rounding errors
@@ -61,6 +61,7 @@ class Search(NamedTuple):
     image: Floats  # A p
     numbers: Floats  # by ALPHA, BETA, R_Z
     rows: Rows
+    largest: Rows  # of what is reduced second in a kernel: a result that was read once is not read again
 
 
 class PressureProjection:
@@ -92,7 +93,8 @@ class PressureProjection:
         self.regions = ClosedRegions(obstacles)
         equation, size = self.multigrid.equation, obstacles.grid.size
         correction, direction, image = (new_floats(size) for _ in range(3))
-        self._search = Search(equation, correction, direction, image, new_floats(3), new_rows(self._box))
+        rows = new_rows(self._box)
+        self._search = Search(equation, correction, direction, image, new_floats(3), rows, with_nodes_of_its_own(rows))
         self.work = (correction, direction, image, equation.right_hand_side, equation.solution, equation.spare)
 
     def update(self) -> None:
@@ -158,10 +160,10 @@ class PressureProjection:
         return largest, speed, mean
 
     def _clear_work(self) -> None:
-        """Ghosts must hold 0, whatever others kept in these arrays."""
-        for array in self.work:
-            if array is not self._search.image:
-                array.fill(0.0)
+        """Ghosts must hold 0, whatever others kept in these arrays; those of coarser levels nobody else has."""
+        equation, search = self._search.equation, self._search
+        clear_ghosts(self._box, Faces(search.correction, search.direction, search.image))
+        clear_ghosts(self._box, Faces(equation.right_hand_side, equation.solution, equation.spare))
 
 
 @kernel
@@ -260,9 +262,9 @@ def _advance(box: Grid, solids: Solids, carried: Carried, search: Search) -> Pai
         largest = 0.0
         for n in range(lane_items(box, box.nz, lane)):
             largest = ti.max(largest, ti.abs(residual[row + lane_place(box, n, lane)]))
-        search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([largest, 0.0])
-    find_maxima(search.rows)
-    return Pair(search.rows.nodes[0][0], ti.select(search.numbers[ALPHA] > 0.0, 1.0, 0.0))
+        search.largest.partial[partial_place(box, i, j, lane)] = ti.Vector([largest, 0.0])
+    find_maxima(search.largest)
+    return Pair(search.largest.nodes[0][0], ti.select(search.numbers[ALPHA] > 0.0, 1.0, 0.0))
 
 
 @kernel

@@ -55,6 +55,14 @@ def new_rows(box: Grid) -> Rows:
     )
 
 
+def with_nodes_of_its_own(rows: Rows) -> Rows:
+    """Room for a second reduction in a kernel, of which the partial results take the place of the first one's.
+
+    Taichi takes what a kernel has read outside of its loops for what is still there, whatever loops have stored since.
+    """
+    return rows._replace(nodes=ti.Vector.ndarray(2, ti.f32, rows.nodes.shape[0]))
+
+
 @func
 def partial_place(box: Grid, i: ti.i32, j: ti.i32, lane: ti.i32) -> ti.i32:
     """Where the lane of a row leaves its numbers."""

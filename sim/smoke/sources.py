@@ -21,7 +21,7 @@ from sim.smoke.obstacles import Air, is_solid, part_before
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 from sim.smoke.source_motion import CELLS, BodyMotion, SourceMotion, SweptShape, motion_of
 
-BLOCK = 256  # cells whose emission one thread adds up
+BLOCK, GPU_BLOCK = 256, 16  # cells whose emission one thread adds up
 FLUCTUATION_CELLS = 4  # edge of the blocks of cells that fluctuate together: smaller ones are averaged away by the flow
 FLUCTUATION_RATE_HZ = 20.0  # how often the fluctuation changes
 BOUNDS_SPACING = 0.5  # of poses around which a box is put, over the reach of a shape
@@ -141,7 +141,8 @@ class Source:
         if self.motion is not None:
             self._cover(self.motion.poses(begin_s, end_s, spacing=self._grid.cell_size / POSES_PER_CELL))
         strength = self.parameters.largest_strength(begin_s, end_s) * self._steadiness(end_s)
-        blocks = -(-max(1, self._cells.count) // BLOCK)
+        block = GPU_BLOCK if air.box.lanes > 1 else BLOCK
+        blocks = -(-max(1, self._cells.count) // block)
         if self._emitted.shape[0] < blocks:
             self._emitted = ti.ndarray(ti.f32, blocks)
         tick, first = int(time_s * FLUCTUATION_RATE_HZ), ti.math.ivec3(self._grid.first)
@@ -149,7 +150,7 @@ class Source:
         targets = ti.math.vec2(strength * self.target_density, strength * self.target_excess)
         is_hot, count = self.target_excess >= 0.0, self._cells.count
         cells = self._cells.indices, self._cells.shares
-        _raise_cells(air, *cells, count, noise, targets, is_hot, blocks, self._emitted)
+        _raise_cells(air, *cells, count, noise, targets, is_hot, block, blocks, self._emitted)
         if self.parameters.velocity is not None:
             for faces, openness, velocity in zip(self._faces, air.openness, air.state.velocity, strict=True):
                 _set_faces(faces.indices, faces.shares, faces.speeds, openness, velocity, faces.count)
@@ -190,6 +191,7 @@ def _raise_cells(
     noise: Noise,
     targets: ti.math.vec2,
     is_hot: ti.template(),
+    size: ti.i32,
     blocks: ti.i32,
     added: Floats,
 ):
@@ -197,7 +199,7 @@ def _raise_cells(
     density, excess = ti.static((air.state.density, air.state.excess))
     for block in range(blocks):
         emitted = 0.0
-        for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, count)):
+        for n in range(block * size, ti.min((block + 1) * size, count)):
             at = cells[n]
             if not is_solid(air.solids, at):
                 before = density[at]

@@ -23,16 +23,20 @@ import math
 
 import taichi as ti
 
-from sim.core.arrays import Floats
+from sim.core.arrays import Floats, Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces, new_floats
 from sim.smoke.combustion import Combustion
 from sim.smoke.cut_cells import CHANGES, KEEPER, LEAST_VOLUME, NEAR_SOLIDS, keeper_of, way
-from sim.smoke.lanes import cell_counts, fill_row, fill_rows, lane_items, lane_place, row_start, steps
+from sim.smoke.lanes import Grid, cell_counts, fill_row, fill_rows, lane_items, lane_place, row_start, steps
 from sim.smoke.obstacles import Air, Solids, flux_part, mean_volume
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 
+# Rows of cells, counted from the nearest one that holds anything, in which each part of a step is computed: beyond them
+# it would find 0. A walk goes one row, what small cells share two; what is taken back acts three beyond that. Each part
+# has from the one before it what it reads around itself.
+SHARPENED, LIMITED, FLUXES, KEPT, SPREAD = 6, 7, 8, 10, 12
 LEAST_ROOM = 1.0e-3  # of cells beside moving solids that tells a density [cells]
 KEEPS_OFF = 1.0e-6
 """Part of the way to a bound that limited fluxes leave: more than rounding of their sum."""
@@ -62,6 +66,8 @@ class Transport:
         self._spread, self._fluxes, self._kept = work[0], Faces(*work[1:4]), work[4:6]
         solids = air.solids
         self._room = new_floats(solids.volume.shape[0]) if solids.moving else solids.volume
+        # Donor cells alone take so little that nothing is left out, as if all rows held something.
+        self._filled, self._beside, self._near = (ti.ndarray(ti.i32, air.box.nx * air.box.ny) for _ in range(3))
 
     def advance(self, step: float) -> None:
         """Carry all by a step over the edge of a cell [s/m], in parts in which no cell gives more than it has."""
@@ -75,19 +81,21 @@ class Transport:
 
     def _carry(self, values: ti.Ndarray, step: float, *, grows: bool, is_last: bool) -> None:
         air, spread, fluxes, (leaving, coming) = self._air, self._spread, self._fluxes, self._kept
-        volume = self._room
+        volume, near = self._room, self._near
+        if self._sharpens:
+            _find_near(air.box, values, self._filled, self._beside, near)
         if air.solids.cuts:
-            _spread(air, values, volume, fluxes.x, step, self._expansion, grows)
+            _spread(air, near, values, volume, fluxes.x, step, self._expansion, grows)
             if air.solids.moving:
                 _drain(air, self._room, step, self._expansion, self._expands)
                 volume = air.solids.volume if is_last else volume
-            _keep(air, fluxes.x, values, self._room, volume, spread)
+            _keep(air, near, fluxes.x, values, self._room, volume, spread)
         else:
-            _spread(air, values, volume, spread, step, self._expansion, grows)
+            _spread(air, near, values, volume, spread, step, self._expansion, grows)
         if self._sharpens:
-            _find_fluxes(air, spread, fluxes, step)
-            _limit(air, values, spread, fluxes, volume, leaving, coming, step)
-            _sharpen(air, values, spread, fluxes, volume, leaving, coming)
+            _find_fluxes(air, near, spread, fluxes, step)
+            _limit(air, near, values, spread, fluxes, volume, leaving, coming, step)
+            _sharpen(air, near, values, spread, fluxes, volume, leaving, coming)
         else:
             values.copy_from(spread)
 
@@ -167,13 +175,54 @@ def _start(air: Air, values: Floats, room: Floats):
 
 
 @kernel
+def _find_near(box: Grid, values: Floats, filled: Integers, beside: Integers, near: Integers):
+    """How many rows each row of cells is off the nearest one that holds anything, along x or y, `SPREAD` + 1 at most.
+
+    `filled` and `beside` are to work in: whether a row holds anything, and the distance along y alone.
+    """
+    for row in range(box.nx * box.ny):
+        filled[row] = 0
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        holds = 0
+        for n in range(lane_items(box, box.nz, lane)):
+            holds |= int(values[row_start(box, i, j) + lane_place(box, n, lane)] != 0.0)
+        if holds != 0:
+            filled[_row(box, i, j)] = 1  # whichever lanes do so
+    for i, j in ti.ndrange((1, box.nx + 1), (1, box.ny + 1)):
+        least = SPREAD + 1
+        for other in range(ti.max(1, j - SPREAD), ti.min(box.ny, j + SPREAD) + 1):
+            if filled[_row(box, i, other)] != 0:
+                least = ti.min(least, ti.abs(other - j))
+        beside[_row(box, i, j)] = least
+    for i, j in ti.ndrange((1, box.nx + 1), (1, box.ny + 1)):
+        least = SPREAD + 1
+        for other in range(ti.max(1, i - SPREAD), ti.min(box.nx, i + SPREAD) + 1):
+            least = ti.min(least, ti.max(ti.abs(other - i), beside[_row(box, other, j)]))
+        near[_row(box, i, j)] = least
+
+
+@func
+def _row(box: Grid, i: ti.i32, j: ti.i32) -> ti.i32:
+    """Number of a row of cells, from 0."""
+    return (i - 1) * box.ny + j - 1
+
+
+@kernel
 def _spread(
-    air: Air, values: Floats, room: Floats, spread: Floats, step: ti.f32, expansion: Floats, grows: ti.template()
+    air: Air,
+    near: Integers,
+    values: Floats,
+    room: Floats,
+    spread: Floats,
+    step: ti.f32,
+    expansion: Floats,
+    grows: ti.template(),
 ):
     """What each cell holds after the walk; what grows with the gas is as much more as that expands."""
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
         given = ti.static((i, j, air, values, room, step, expansion, grows))
-        fill_row(air.box, spread, row_start(air.box, i, j), air.box.nz, lane, _spread_cell, given)
+        if near[_row(air.box, i, j)] <= SPREAD:
+            fill_row(air.box, spread, row_start(air.box, i, j), air.box.nz, lane, _spread_cell, given)
 
 
 @kernel
@@ -200,11 +249,11 @@ def _in_range(density: ti.f32, low: ti.f32, high: ti.f32, size: ti.f32, before: 
 
 
 @kernel
-def _keep(air: Air, held: Floats, values: Floats, room: Floats, volume: Floats, spread: Floats):
+def _keep(air: Air, near: Integers, held: Floats, values: Floats, room: Floats, volume: Floats, spread: Floats):
     """Density of what cells hold, the same in small ones and their keepers."""
     box, solids = ti.static((air.box, air.solids))
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
-        for n in range(lane_items(box, box.nz, lane)):
+        for n in range(lane_items(box, box.nz, lane) * int(near[_row(box, i, j)] <= KEPT)):
             at = row_start(box, i, j) + lane_place(box, n, lane)
             word = solids.words[at]
             keeper = keeper_of(word, at, box)
@@ -224,15 +273,17 @@ def _keep(air: Air, held: Floats, values: Floats, room: Floats, volume: Floats, 
 
 
 @kernel
-def _find_fluxes(air: Air, spread: Floats, fluxes: Faces, step: ti.f32):
+def _find_fluxes(air: Air, near: Integers, spread: Floats, fluxes: Faces, step: ti.f32):
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
         outs, given = ti.static((fluxes.x, fluxes.y, fluxes.z), (i, j, air, spread, step))
-        fill_rows(air.box, outs, row_start(air.box, i, j), air.box.nz, lane, _fluxes_into, given)
+        if near[_row(air.box, i, j)] <= FLUXES:
+            fill_rows(air.box, outs, row_start(air.box, i, j), air.box.nz, lane, _fluxes_into, given)
 
 
 @kernel
 def _limit(
     air: Air,
+    near: Integers,
     values: Floats,
     spread: Floats,
     fluxes: Faces,
@@ -243,14 +294,25 @@ def _limit(
 ):
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
         outs, given = ti.static((leaving, coming), (i, j, air, values, spread, fluxes, volume, step))
-        fill_rows(air.box, outs, row_start(air.box, i, j), air.box.nz, lane, _kept_shares, given)
+        if near[_row(air.box, i, j)] <= LIMITED:
+            fill_rows(air.box, outs, row_start(air.box, i, j), air.box.nz, lane, _kept_shares, given)
 
 
 @kernel
-def _sharpen(air: Air, values: Floats, spread: Floats, fluxes: Faces, volume: Floats, leaving: Floats, coming: Floats):
+def _sharpen(
+    air: Air,
+    near: Integers,
+    values: Floats,
+    spread: Floats,
+    fluxes: Faces,
+    volume: Floats,
+    leaving: Floats,
+    coming: Floats,
+):
     for i, j, lane in ti.ndrange((1, air.box.nx + 1), (1, air.box.ny + 1), air.box.lanes):
         given = ti.static((i, j, air, spread, fluxes, volume, leaving, coming))
-        fill_row(air.box, values, row_start(air.box, i, j), air.box.nz, lane, _sharpened, given)
+        if near[_row(air.box, i, j)] <= SHARPENED:
+            fill_row(air.box, values, row_start(air.box, i, j), air.box.nz, lane, _sharpened, given)
 
 
 @func

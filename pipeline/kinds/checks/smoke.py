@@ -33,8 +33,8 @@ from sim.shapes.solid import Solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
 
-BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 374, 250
-"""Upper bounds: 214 for the solver and its couplings, and, where a CPU computes, 159 for the six snapshots and
+BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 378, 250
+"""Upper bounds: 219 for the solver and its couplings, and, where a CPU computes, 159 for the six snapshots and
 checkpoints that the simulation may hold at once; on a GPU these are not in its memory."""
 FIRE_BYTES, FIRE_BYTES_ON_GPU = 36, 8
 """On top for each cell where fuel burns: fuel and expansion, and fuel in checkpoints."""

@@ -28,7 +28,7 @@ JOB = {
     ],
     "rigid": [
         {
-            **{"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.15}},
+            **{"name": "ball", "kind": "dynamic", "density": 100.0, "shape": {"type": "sphere", "radius": 0.15}},
             **{"position": (0.0, 0.0, 0.6), "velocity": (0.1, 0.0, 0.0)},
         }
     ],

@@ -1,5 +1,7 @@
 """Bodies that the air of a smoke pushes."""
 
+import itertools
+
 import numpy as np
 import pytest
 from thread_counts import digest_of, result_on_any_threads
@@ -300,6 +302,55 @@ def test_a_window_goes_with_a_body_that_falls():
     assert np.all(place + 0.1 < np.array(grid.upper))
     fallen = 2.6 - place[2]
     assert 0.5 * G * 0.2**2 * 0.5 < fallen < 0.5 * G * 0.2**2 * 0.72  # 0.68 of it by lift and added mass
+
+
+def thrown_ball():
+    """At six cells a frame, in a window that goes with it; in gusts, where moving air alone does not count."""
+    thrown = ball(0.1, 60.0, (0.4, 0.5, 0.5), velocity=(9.0, 0.2, 0.0), angular_velocity=(0.0, 5.0, 0.0))
+    smoke = {"grid": "window", "turbulence": {"strength": 0.1}}
+    return build([thrown], cells=80, size=(4.0, 1.0, 1.0), gravity=0.0, fps=30.0, **smoke)
+
+
+def falling_slab():
+    """Of five pieces, in a window that does not reach the ends of its long box; it breaks on the floor."""
+    slab = {"name": "slab", "kind": "dynamic", "density": 30.0, "shape": {"type": "box", "size": (0.4, 0.3, 0.12)}}
+    slab |= {"position": (1.5, 0.5, 0.4), "rotation_deg": (0.0, 20.0, 0.0), "velocity": (1.0, 0.0, -3.0)}
+    slab |= {"breaks": {"strength": 50.0, "pieces": 5, "seed": 2}}
+    floor = {"name": "floor", "kind": "static", "shape": {"type": "box", "size": (6.0, 2.0, 0.2)}}
+    bodies = [slab, {**floor, "position": (1.5, 0.5, 0.0)}]
+    return build(bodies, cells=60, size=(3.0, 1.0, 1.0), grid="window")
+
+
+def test_a_window_behind_a_fast_body_is_fitted_once_in_some_frames():
+    world, windows = thrown_ball(), []
+    for _ in range(9):
+        world.advance_frame()
+        windows.append(world.solvers["air"].grid.window)
+    assert bodies_of(world).position[0, 0] > 2.8
+    assert 2 <= sum(before != after for before, after in itertools.pairwise(windows)) <= 3
+
+
+@pytest.mark.parametrize(("scene", "frames", "stops"), [(thrown_ball, 9, (2, 6)), (falling_slab, 8, (2, 6))])
+def test_bodies_in_a_window_go_on_from_a_checkpoint_to_the_bit(scene, frames, stops):
+    """While the window is that of the start, and once it has gone on; before a body breaks, and after."""
+    world, kept = scene(), {}
+    first = world.solvers["air"].grid.window
+    for _ in range(frames):
+        world.advance_frame()
+        kept[world.frame] = {name: array.copy() for name, array in world.checkpoint().items()}
+    before, after = (kept[stop] for stop in stops)
+    assert min(np.abs(state["rigid/air_push"]).max() for state in (before, after)) > 1.0e-3
+    assert after["air/window"].tolist() != [list(first.first), list(first.cells)]
+    if scene is falling_slab:
+        assert not before["rigid/glue_broken"].any()
+        assert after["rigid/glue_broken"].any()
+    for stop in stops:
+        again = scene()
+        again.restore(stop, kept[stop])
+        while again.frame < frames:
+            again.advance_frame()
+        for name, array in again.checkpoint().items():
+            np.testing.assert_array_equal(array, kept[frames][name], err_msg=name)
 
 
 @pytest.mark.parametrize(("quantity", "value"), [("position", np.nan), ("position", np.inf), ("orientation", np.nan)])

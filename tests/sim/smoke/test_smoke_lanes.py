@@ -13,8 +13,8 @@ from sim.core.launch import kernel
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
 from sim.smoke import multigrid
-from sim.smoke.arrays import new_floats
-from sim.smoke.lanes import Grid, device_grid, lane_items, lane_place, row_start
+from sim.smoke.arrays import new_faces, new_floats
+from sim.smoke.lanes import Grid, clear_ghosts, device_grid, lane_items, lane_place, row_start
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up
 from sim.smoke.solver import SmokeSolver
@@ -167,3 +167,14 @@ def test_a_plume_is_the_same_whatever_takes_the_levels_of_a_cycle(monkeypatch, o
             # The same arithmetic, but for products that are contracted otherwise.
             difference = np.abs(state[name].astype(np.float64) - array.astype(np.float64)).max()
             assert difference <= 5.0e-6 * np.abs(array).max(), name
+
+
+def test_ghosts_are_cleared_and_cells_are_not(on_gpu):
+    box, arrays = device_grid((5, 3, 40)), new_faces(7 * 5 * 42)
+    for array in arrays:
+        array.fill(1.0)
+    clear_ghosts(box, arrays)
+    for array in arrays:
+        values = array.to_numpy().reshape(7, 5, 42)
+        assert (values[1:-1, 1:-1, 1:-1] == 1.0).all()
+        assert values.sum() == 5 * 3 * 40

@@ -58,6 +58,28 @@ def test_projected_velocity_is_free_of_divergence_and_still_at_walls(cells, open
     assert report.iterations <= 8
 
 
+def test_iterations_end_by_the_largest_divergence_that_is_left(open_box, monkeypatch):
+    """And by no other number: a solve goes on while that is above its goal, and needs no second one."""
+    grid, velocity, projection = open_box
+    set_faces(grid, velocity, rough_velocity(grid))
+    advance, told, left, solves = projection._advance, [], [], []
+
+    def watched():
+        numbers = advance()
+        told.append(numbers[0])
+        residual = projection.multigrid.equation.right_hand_side.to_numpy()[: grid.size].reshape(grid.padded)
+        left.append(float(np.abs(residual[1:-1, 1:-1, 1:-1]).max()))
+        return numbers
+
+    solve = projection._solve
+    monkeypatch.setattr(projection, "_advance", watched)
+    monkeypatch.setattr(projection, "_solve", lambda *given: solves.append(given) or solve(*given))
+    assert projection.project().converged
+    assert told == left
+    assert len(told) > 2
+    assert len(solves) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("open_faces", [OPEN_BOX, CLOSED_BOX], ids=["open", "closed"])
 @pytest.mark.parametrize("obstacle", [True, False], ids=["ball", "empty"])

@@ -1,15 +1,18 @@
 import numpy as np
 import pytest
 from smoke_scenes import CLOSED_BOX, OPEN_BOX, air_in, unit_grid
+from thread_counts import digest_of
 
+from sim.build import build_world
 from sim.core.domain import DomainParameters
+from sim.scene import SceneParameters
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
 from sim.smoke.arrays import new_floats
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
-from sim.smoke.transport import Transport
+from sim.smoke.transport import SPREAD, Transport
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
@@ -111,3 +114,33 @@ def test_a_plume_holds_what_its_source_gave(open_faces):
     numbers = solver.diagnostics()
     # Nothing has reached an open side yet; the closed box has been stirred for ten seconds. Rounding alone.
     assert numbers["mass"] == pytest.approx(numbers["emitted_mass"], rel=1.0e-5)
+
+
+PLATE = {"shape": {"type": "box", "size": (0.1, 0.4, 0.3)}, "position": (0.62, 0.5, 0.25), "rotation_deg": (0, 0, 30)}
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [{}, {"rigid": [{"name": "plate", "kind": "static", **PLATE}], "fire": {}}, {"rigid": [{
+        "name": "plate", "kind": "kinematic", "velocity": (-0.8, 0.2, 0.0), **PLATE}]}],
+    ids=["plain", "fire at a wall", "beside what moves"],
+)  # fmt: skip
+def test_rows_that_are_left_out_are_far_from_smoke_and_change_no_bit(scene, monkeypatch):
+    smoke = {"name": "air", "cell_size": 1.0 / 24.0, "wind": (1.5, 0.5, 0.0), "open_faces": OPEN_BOX}
+    source = {**SOURCE, "shape": {"type": "sphere", "radius": 0.12}, "velocity": (3.0, 0.0, 0.0), "end_s": 0.1}
+    if "fire" in scene:
+        smoke, source = {**smoke, "fire": scene["fire"]}, {**source, "temperature": 900.0, "fuel": 0.5}
+    domain = {"min": (0.0, 0.0, 0.0), "max": (3.0, 2.0, 0.5)}
+    keys = {"domain": domain, "rigid": scene.get("rigid", []), "smoke": [{**smoke, "source": [source]}]}
+    digests, left_out = [], []
+    for leaves_out in (True, False):
+        if not leaves_out:  # the distances stay 0
+            monkeypatch.setattr("sim.smoke.transport._find_near", lambda *_: None)
+        world = build_world(SceneParameters.model_validate(keys), frames_per_second=24.0)
+        for _ in range(4):
+            world.advance_frame()
+        digests.append(digest_of(world.checkpoint()))
+        left_out.append((world.solvers["air"]._transport._near.to_numpy() > SPREAD).mean())
+    assert digests[0] == digests[1]
+    assert left_out[0] > 0.1
+    assert left_out[1] == 0.0
