@@ -360,7 +360,9 @@ class RigidSolver:
         bodies = self.bodies
         turning = dt * (bodies.spins() * self._radius + bodies.deforming)
         of_moving = (bodies.position, dt * bodies.velocity, dt * bodies.angular_velocity, turning)
-        motion = (self._with_obstacles(np.where(moves.reshape(-1, *[1] * (each.ndim - 1)), each, 0.0)) for each in of_moving)
+        motion = (
+            self._with_obstacles(np.where(moves.reshape(-1, *[1] * (each.ndim - 1)), each, 0.0)) for each in of_moving
+        )
         return self._detector.misses(Motion(*motion), LEAST_MISSED)
 
     def _carried(self, contacts: Contacts, time_s: float) -> Carried:

@@ -116,7 +116,9 @@ def moved_on(point: Vector3, body: ti.i32, motion: Motion) -> Vector3:
 
 
 @func
-def lowest(own: ti.i32, other: ti.i32, contact: ti.i32, bodies: Bodies, kept: Kept, polytopes: Polytopes, motion: Motion):
+def lowest(
+    own: ti.i32, other: ti.i32, contact: ti.i32, bodies: Bodies, kept: Kept, polytopes: Polytopes, motion: Motion
+):
     """How far a polytope is above the plane of a contact that is fixed to another body [m], at the least of now and
     the end of the step."""
     shape = bodies.shape[own]
