@@ -65,7 +65,7 @@ class SimulateStage(Stage):
 
     name = "simulate"
     about = "the physics, frame by frame"
-    version = 28
+    version = 29
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""

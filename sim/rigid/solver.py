@@ -358,11 +358,10 @@ class RigidSolver:
         if not np.any(got > reach + LEAST_MISSED * self._edge):
             return False
         bodies = self.bodies
-        turning = dt * (bodies.spins() * self._radius + bodies.deforming)
-        of_moving = (bodies.position, dt * bodies.velocity, dt * bodies.angular_velocity, turning)
-        motion = (
-            self._with_obstacles(np.where(moves.reshape(-1, *[1] * (each.ndim - 1)), each, 0.0)) for each in of_moving
-        )
+        moved = dt * moves
+        turning = moved * (bodies.spins() * self._radius + bodies.deforming)
+        turned, velocity = moved[:, None] * bodies.angular_velocity, moved[:, None] * bodies.velocity
+        motion = map(self._with_obstacles, (bodies.position, velocity, turned, turning))
         return self._detector.misses(Motion(*motion), LEAST_MISSED)
 
     def _carried(self, contacts: Contacts, time_s: float) -> Carried:

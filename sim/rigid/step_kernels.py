@@ -119,8 +119,7 @@ def moved_on(point: Vector3, body: ti.i32, motion: Motion) -> Vector3:
 def lowest(
     own: ti.i32, other: ti.i32, contact: ti.i32, bodies: Bodies, kept: Kept, polytopes: Polytopes, motion: Motion
 ):
-    """How far a polytope is above the plane of a contact that is fixed to another body [m], at the least of now and
-    the end of the step."""
+    """How far a polytope is before the plane of a contact that is fixed to another body, now and at the end [m]."""
     shape = bodies.shape[own]
     anchor = turned(bodies.pose, other, vector_at(kept.planes, contact, 0)) + vector_at(bodies.pose, other, 0)
     outward = turned(bodies.pose, other, vector_at(kept.planes, contact, 3))
