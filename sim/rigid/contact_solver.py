@@ -17,8 +17,8 @@ COARSE_SPEED = 0.05
 COARSE_WORK, COARSE_CONTACTS, FEWEST_ITERATIONS = 15_000, 0.8, 18
 """Islands whose contacts are faster [m/s], in the mean, get the most of three numbers of sweeps: what makes so many
 looks at contacts; s, if they have so many contacts times s³, as a heap is high; the least that any gets. What is left
-of their overlap is far less than they move in the step. In piles half as many move them apart: overlaps come from what
-is left of velocities."""
+of their overlap is far less than they move in the step. Half as many move large piles apart: overlaps come from what is
+left of velocities."""
 RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 

@@ -346,9 +346,10 @@ def may_change_in(solve: ti.template(), island: ti.i32, pile: Pile, limits: Limi
 
 @func
 def most_in(solve: ti.template(), island: ti.i32, pile: Pile, limits: Limits) -> ti.i32:
-    """How many sweeps an island gets at most; half as many move it apart, unless it gets all of them."""
+    """How many sweeps an island gets at most; half as many move it apart if it is worth fewer looks than it gets."""
     most = ti.cast(pile.islands[island, MOST], ti.i32)
-    if ti.static(solve == 1) and most < limits.most:
+    is_large = most < limits.most and pile.islands[island, CONTACTS] * most > limits.coarse_work
+    if ti.static(solve == 1) and is_large:
         most = (most + 1) // 2
     return most
 

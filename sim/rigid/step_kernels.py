@@ -22,6 +22,8 @@ from sim.rigid.collision_kernels import (
 from sim.rigid.contact_kernels import row_of
 from sim.rigid.polytope_kernels import FIRST_VERTEX, VERTICES, Polytopes
 
+PASSED = 0.1  # of how much farther than looked for counts: how far the plane of a contact may be passed
+
 
 @bundle
 class Speeds(NamedTuple):
@@ -167,8 +169,7 @@ def count_missed(
 
     Args:
         near: the pairs, with the contacts that are `kept` of them.
-        least: how much farther counts, and how deep the plane of a contact may be passed, in shortest edges of the
-            smaller body [-].
+        least: how much farther counts, in shortest edges of the smaller body [-].
     """
     for pair in range(count):
         one, two = near.pairs[pair, 0], near.pairs[pair, 1]
@@ -181,7 +182,7 @@ def count_missed(
                 for axis in ti.static(range(3)):
                     apart = ti.max(apart, bodies.box[one, axis] + away[axis] - bodies.box[two, 3 + axis])
                     apart = ti.max(apart, bodies.box[two, axis] - away[axis] - bodies.box[one, 3 + axis])
-                if apart <= turns and not stays_apart(pair, deepest, near, bodies, kept, polytopes, motion):
+                if apart <= turns and not stays_apart(pair, PASSED * deepest, near, bodies, kept, polytopes, motion):
                     missed[0] += 1
 
 
