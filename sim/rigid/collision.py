@@ -23,7 +23,6 @@ from sim.rigid.broad_phase import overlapping_pairs
 from sim.rigid.collision_shapes import CollisionShapes
 from sim.rigid.contacts import BODY_BITS, WALL_BITS, Array, Contacts, Indices, pair_keys, rows_of
 from sim.rigid.polytope_kernels import find_polytope_contacts
-from sim.rigid.step_kernels import Motion, count_missed
 from sim.rigid.tables import fill, kept, larger, larger_tables
 from sim.shapes.body_geometry import BodyGeometry
 
@@ -161,17 +160,19 @@ class CollisionDetector:
             fill(near.before, np.arange(count, dtype=np.int32))
             self._is_renewed = False
 
-    def misses(self, motion: Motion, least: float) -> bool:
+    def misses(self, velocity: Array, turning: Array, least: float) -> bool:
         """Whether bodies may meet in the step, of which contacts were not looked for as they got faster by others.
 
         Args:
-            motion: how all bodies move in the step, each about its centre.
+            velocity: of all bodies times the step [m], (n + 1, 3).
+            turning: how far their farthest points turn about centres of mass, or deform [m], (n + 1,).
             least: by how much farther than looked for they get at least, in shortest edges [-].
         """
+        from sim.rigid.step_kernels import count_missed
+
         count, missed = len(self._pairs), np.zeros(1, dtype=np.int32)
         if count:
-            polytopes = self._shapes.polytopes
-            count_missed(count, self._near, self._bodies, self._kept, polytopes, motion, least, missed)
+            count_missed(count, self._near.pairs, self._bodies, velocity, turning, least, missed)
         return bool(missed[0])
 
     def look(self, poses: Poses, motion: Array) -> None:

@@ -13,7 +13,6 @@ from sim.core.solver import Arrays
 from sim.core.walls import Wall
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import BODY_BITS, Array, Contacts, Indices, pair_keys, rows_of
-from sim.rigid.step_kernels import Motion
 from sim.shapes.body_geometry import BodyGeometry
 
 
@@ -81,9 +80,9 @@ class PartsDetector:
         """Find the contacts of all active bodies in poses, and at a time [s]."""
         self._inner.find(self._of_parts(poses), motion[self._of_part], is_active[self._of_part[:-1]], time_s)
 
-    def misses(self, motion: Motion, least: float) -> bool:
+    def misses(self, velocity: Array, turning: Array, least: float) -> bool:
         """Whether parts may meet in the step, of which contacts were not looked for."""
-        return self._inner.misses(Motion(*(each[self._of_part] for each in motion)), least)
+        return self._inner.misses(velocity[self._of_part], turning[self._of_part], least)
 
     def contacts(self) -> Contacts:
         """Those found last of active bodies, by pair of parts, told of movers."""

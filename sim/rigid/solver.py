@@ -31,7 +31,6 @@ from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.parts import PartsDetector, detector_of
 from sim.rigid.paths import path_of
 from sim.rigid.states import MovingBodies, lengths
-from sim.rigid.step_kernels import Motion
 from sim.rigid.steps import LARGEST_TURN, MOST_OWN_STEPS, StepChooser, groups_of
 from sim.rigid.surroundings import Surroundings
 from sim.shapes.body_geometry import BodyGeometry
@@ -358,11 +357,9 @@ class RigidSolver:
         if not np.any(got > reach + LEAST_MISSED * self._edge):
             return False
         bodies = self.bodies
-        moved = dt * moves
-        turning = moved * (bodies.spins() * self._radius + bodies.deforming)
-        turned, velocity = moved[:, None] * bodies.angular_velocity, moved[:, None] * bodies.velocity
-        motion = map(self._with_obstacles, (bodies.position, velocity, turned, turning))
-        return self._detector.misses(Motion(*motion), LEAST_MISSED)
+        turning = np.where(moves, dt * (bodies.spins() * self._radius + bodies.deforming), 0.0)
+        velocity = np.where(moves[:, None], dt * bodies.velocity, 0.0)
+        return self._detector.misses(self._with_obstacles(velocity), self._with_obstacles(turning), LEAST_MISSED)
 
     def _carried(self, contacts: Contacts, time_s: float) -> Carried:
         """The sides of contacts that are on surfaces that deform, with their velocities at a time [s]."""

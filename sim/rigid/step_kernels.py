@@ -7,22 +7,8 @@ import taichi as ti
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel_of_host_arrays
 from sim.rigid.array_types import Numbers, Rows, Vector3, Whole, WholeRows
-from sim.rigid.collision_kernels import (
-    CONTACT_BAND,
-    FAR,
-    TRUSTED_MOTION,
-    Bodies,
-    Kept,
-    Near,
-    Placed,
-    margin_of,
-    turned,
-    vector_at,
-)
+from sim.rigid.collision_kernels import CONTACT_BAND, FAR, TRUSTED_MOTION, Bodies, Placed, margin_of
 from sim.rigid.contact_kernels import row_of
-from sim.rigid.polytope_kernels import FIRST_VERTEX, VERTICES, Polytopes
-
-PASSED = 0.1  # of how much farther than looked for counts: how far the plane of a contact may be passed
 
 
 @bundle
@@ -97,92 +83,29 @@ def count_fast(
                 fast[0] += 1
 
 
-@bundle
-class Motion(NamedTuple):
-    """How all bodies move in a step, the domain last, (b,)."""
-
-    centre: Rows  # what they turn about [m], (b, 3)
-    velocity: Rows  # of the centre, times the step [m], (b, 3)
-    spin: Rows  # angular velocity times the step [rad], (b, 3)
-    turning: Numbers  # how far the farthest points turn about the centre, or move as bodies deform [m]
-
-
-@func
-def moved_on(point: Vector3, body: ti.i32, motion: Motion) -> Vector3:
-    """Where a point of a body is at the end of the step."""
-    arm, turn = point - row_of(motion.centre, body), row_of(motion.spin, body)
-    angle = ti.max(turn.norm(), ti.cast(1.0e-30, ti.f64))
-    axis = turn / angle
-    across, half = axis.cross(arm), ti.sin(0.5 * angle)
-    return point + row_of(motion.velocity, body) + ti.sin(angle) * across + 2.0 * half * half * axis.cross(across)
-
-
-@func
-def lowest(
-    own: ti.i32, other: ti.i32, contact: ti.i32, bodies: Bodies, kept: Kept, polytopes: Polytopes, motion: Motion
-):
-    """How far a polytope is before the plane of a contact that is fixed to another body, now and at the end [m]."""
-    shape = bodies.shape[own]
-    anchor = turned(bodies.pose, other, vector_at(kept.planes, contact, 0)) + vector_at(bodies.pose, other, 0)
-    outward = turned(bodies.pose, other, vector_at(kept.planes, contact, 3))
-    anchor_then = moved_on(anchor, other, motion)
-    outward_then = moved_on(anchor + outward, other, motion) - anchor_then
-    first, height = polytopes.whole[shape, FIRST_VERTEX], ti.cast(FAR, ti.f64)
-    for row in range(first, first + polytopes.whole[shape, VERTICES]):
-        corner = turned(bodies.pose, own, vector_at(polytopes.vertices, row, 0)) + vector_at(bodies.pose, own, 0)
-        height = ti.min(height, outward.dot(corner - anchor))
-        height = ti.min(height, outward_then.dot(moved_on(corner, own, motion) - anchor_then))
-    return height - polytopes.radii[shape]
-
-
-@func
-def stays_apart(
-    pair: ti.i32, deepest: ti.f64, near: Near, bodies: Bodies, kept: Kept, polytopes: Polytopes, motion: Motion
-) -> bool:
-    """Whether one of the planes in which two polytopes have contacts keeps them apart but for so much [m]."""
-    stays = False
-    if near.pairs[pair, 3] == 0:
-        for contact in range(kept.starts[pair], kept.starts[pair + 1]):
-            if not stays:
-                own, other = near.pairs[pair, 0], near.pairs[pair, 1]
-                if kept.features[contact, 0] == 1:
-                    own, other = other, own
-                stays = lowest(own, other, contact, bodies, kept, polytopes, motion) >= -deepest
-    return stays
-
-
 @kernel_of_host_arrays
 def count_missed(
-    count: ti.i32,
-    near: Near,
-    bodies: Bodies,
-    kept: Kept,
-    polytopes: Polytopes,
-    motion: Motion,
-    least: ti.f64,
-    missed: Whole,
+    count: ti.i32, pairs: WholeRows, bodies: Bodies, velocity: Rows, turning: Numbers, least: ti.f64, missed: Whole
 ):
     """Count in `missed` those of so many pairs that get farther than was looked for, and whose boxes meet then.
 
-    Polytopes that a plane of one of their contacts keeps apart are left out, whatever speed they got: a box that
-    another one turns, or takes along. So are walls, as contacts with them are never far.
-
     Args:
-        near: the pairs, with the contacts that are `kept` of them.
+        pairs: those of `collision_kernels.Near`; walls are left out, as contacts with them are never far.
+        velocity: of all bodies, times the step [m], (b, 3).
+        turning: how far the farthest points turn about centres of mass, and move as bodies deform [m], (b,).
         least: how much farther counts, in shortest edges of the smaller body [-].
     """
     for pair in range(count):
-        one, two = near.pairs[pair, 0], near.pairs[pair, 1]
-        if near.pairs[pair, 2] < 0:
-            away = row_of(motion.velocity, one) - row_of(motion.velocity, two)
-            turns = motion.turning[one] + motion.turning[two]
-            deepest = least * ti.min(bodies.size[one], bodies.size[two])
-            if away.norm() + turns > margin_of(one, two, bodies) + deepest:
+        one, two = pairs[pair, 0], pairs[pair, 1]
+        if pairs[pair, 2] < 0:
+            away = row_of(velocity, one) - row_of(velocity, two)
+            turns = turning[one] + turning[two]
+            if away.norm() + turns > margin_of(one, two, bodies) + least * ti.min(bodies.size[one], bodies.size[two]):
                 apart = -ti.cast(FAR, ti.f64)
                 for axis in ti.static(range(3)):
                     apart = ti.max(apart, bodies.box[one, axis] + away[axis] - bodies.box[two, 3 + axis])
                     apart = ti.max(apart, bodies.box[two, axis] - away[axis] - bodies.box[one, 3 + axis])
-                if apart <= turns and not stays_apart(pair, PASSED * deepest, near, bodies, kept, polytopes, motion):
+                if apart <= turns:
                     missed[0] += 1
 
 

@@ -12,7 +12,6 @@ from sim.rigid.collision import CollisionDetector
 from sim.rigid.contacts import Contacts
 from sim.rigid.polytopes import polytope_of
 from sim.rigid.solver import RigidSolver
-from sim.rigid.step_kernels import Motion
 
 PROBE = 0.01
 
@@ -124,34 +123,6 @@ def test_a_body_in_a_corner_of_the_domain_has_contacts_with_each_wall():
     found = contacts_of(solver, 0.001)
     assert {tuple(normal) for normal in found.normal.tolist()} == {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
     assert len(np.unique(found.keys())) == len(found) >= 8
-
-
-@pytest.mark.parametrize(
-    ("velocity", "spin", "missed"),
-    [
-        ((0.02, 0.0, 0.0), (0.0, 0.0, 0.0), False),  # along the plate
-        ((0.0, 0.0, 0.02), (0.0, 0.0, 0.0), False),  # away from it
-        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.3), False),  # about the plate's normal
-        ((0.0, 0.0, 0.0), (0.0, -0.1, 0.0), False),  # the edge that hangs above gets higher, and the other one lower
-        ((0.0, 0.0, 0.0), (0.0, 0.3, 0.0), True),  # the edge that hangs above turns into the plate
-        ((0.0, 0.0, -0.02), (0.0, 0.0, 0.0), True),
-    ],
-)
-def test_who_gets_farther_than_was_looked_for_misses_somebody_only_if_no_plane_keeps_them_apart(velocity, spin, missed):
-    """A box that stands on one of its edges, tilted by 10 degrees."""
-    plate = body("plate", {"type": "box", "size": (2.0, 2.0, 0.2)}, (0.0, 0.0, 0.1), kind="static")
-    tilt = np.radians(10.0)
-    place = np.array([0.0, 0.0, 0.2 + 0.1 * (np.cos(tilt) + np.sin(tilt))])
-    solver = in_room(body("box", cube(0.2), tuple(place), rotation_deg=(0.0, 10.0, 0.0)), obstacles=[plate])
-    detector = CollisionDetector(solver.all_geometries, solver.walls, 1)
-    detector.find(solver.poses(), np.zeros(3), np.array([True, False]))
-    assert len(detector.contacts()) == 2
-    centre, moved, turned = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    # About the edge that it stands on, which stays where it is.
-    edge = np.array([-0.1 * np.cos(tilt) - 0.1 * np.sin(tilt), 0.0, 0.2])
-    centre[0], moved[0], turned[0] = edge, velocity, spin
-    turning = np.array([np.linalg.norm(spin) * 0.35, 0.0, 0.0])
-    assert detector.misses(Motion(centre, moved, turned, turning), 0.01) == missed
 
 
 @pytest.mark.parametrize("overlapping", [overlapping_pairs, overlapping_on_host])

@@ -9,7 +9,6 @@ import trimesh
 from rigid_scenes import advance, ball, body, cube, energy, in_room, in_space
 
 from sim.core.domain import DomainParameters
-from sim.rigid.collision import CollisionDetector
 from sim.rigid.solver import SLEEP_TIME_S, RigidSolver
 
 
@@ -152,28 +151,6 @@ def test_what_is_hit_does_not_enter_the_next_of_a_row(edge, density, gap, slowes
         solver.substep(1 / 540)
     assert solver.bodies.velocity[:, 0].min() > slowest
     assert solver.diagnostics()["max_penetration"] < 1e-4
-
-
-def test_a_box_that_is_hit_and_slides_on_meets_nobody_and_takes_no_step_again(monkeypatch):
-    """It gets ten times as far as was looked for, along the face on which it lies."""
-    plate = body("plate", {"type": "box", "size": (2.0, 0.4, 0.2)}, (0.5, 0.0, 0.1), kind="static")
-    lies = body("lies", cube(0.1), (0.0, 0.0, 0.25), friction=0.0)
-    hit = body("hit", cube(0.1), (-0.105, 0.0, 0.2501), velocity=(3.0, 0.0, 0.0), friction=0.0)
-    solver = in_room(lies, hit, obstacles=[plate])
-    looks: list[float] = []
-    find = CollisionDetector.find
-
-    def counted(self, poses, motion, *others):
-        looks.append(float(motion[0]))
-        find(self, poses, motion, *others)
-
-    monkeypatch.setattr(CollisionDetector, "find", counted)
-    for _ in range(6):
-        solver.substep(1 / 540)
-    assert solver.bodies.velocity[0, 0] > 1.4  # half of the speed, or all of it
-    assert solver.bodies.position[0, 2] == pytest.approx(0.25, abs=1e-5)
-    assert len(looks) == 6
-    assert min(looks) < 0.1 * 1.4 / 540
 
 
 def test_hulls_in_a_bowl_come_to_rest_without_sinking_in(tmp_path):
