@@ -8,6 +8,8 @@ from scipy.spatial import cKDTree
 
 from sim.rigid.contacts import Array, Indices
 
+PAIRS_OF_A_BOX = 32  # for which there is room at first
+
 
 def overlapping_pairs(lower: Array, upper: Array, moves: NDArray[np.bool_]) -> tuple[Indices, Indices]:
     """Pairs of boxes that overlap or touch, of which one at least moves: the lower number first, ascending.
@@ -25,14 +27,14 @@ def overlapping_pairs(lower: Array, upper: Array, moves: NDArray[np.bool_]) -> t
     boxes = np.concatenate([lower, upper], axis=1)
     axis = int(np.argmax(np.std(lower, axis=0)))
     order = np.argsort(boxes[:, axis], kind="stable").astype(np.int32)
-    numbers, starts = np.zeros(len(order), dtype=np.int32), np.zeros(len(order), dtype=np.int32)
-    pairs = np.zeros((1, 2), dtype=np.int32)
-    for fills in (0, 1):
-        overlapping_boxes(boxes, axis, order, moves.astype(np.int32), fills, numbers, starts, pairs)
-        if fills == 0:
-            starts = (np.cumsum(numbers) - numbers).astype(np.int32)
-            pairs = np.zeros((max(1, int(numbers.sum())), 2), dtype=np.int32)
-    first, second = pairs[: int(numbers.sum())].astype(np.int64).T
+    numbers, room = np.zeros(len(order), dtype=np.int32), PAIRS_OF_A_BOX
+    while True:
+        pairs = np.zeros((len(order), room, 2), dtype=np.int32)
+        overlapping_boxes(boxes, axis, order, moves.astype(np.int32), numbers, pairs)
+        if (most := int(numbers.max(initial=0))) <= room:
+            break
+        room = most
+    first, second = pairs[np.arange(room) < numbers[:, None]].astype(np.int64).T
     order = np.lexsort((second, first))
     return first[order], second[order]
 

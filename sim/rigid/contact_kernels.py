@@ -10,10 +10,6 @@ from sim.rigid.array_types import Eases, Numbers, Rows, Vector3, Velocities, Who
 from sim.rigid.joint_kernels import JointRows, relax_joints
 from sim.rigid.joint_system import UNBOUNDED
 
-MAX_FRICTION_STEPS = 12
-FRICTION_ROUNDING = 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
-
-
 NORMAL, ARM, LEAST, LOWEST, OWN = 0, 3, 9, 10, 11
 IMPULSE, CHANGE, AHEAD, FRICTION, SLIP, TANGENT = 17, 20, 23, 26, 27, 28
 """Columns of what a contact is while its island is solved: arms are two, tangents of three numbers too; OWN is what it
@@ -153,8 +149,14 @@ def gather_contact(
                     other = normal if ti.static(column == 0) else (first if ti.static(column == 1) else second)
                     block[row, column] += answer.dot(other)
     half, mean = 0.5 * (block[1, 1] - block[2, 2]), 0.5 * (block[1, 1] + block[2, 2])
-    spread, angle = ti.sqrt(half * half + block[1, 2] * block[1, 2]), 0.5 * ti.atan2(block[1, 2], half)
-    c, s = ti.cos(angle), ti.sin(angle)
+    spread, c, s = ti.sqrt(half * half + block[1, 2] * block[1, 2]), ti.cast(1.0, ti.f64), ti.cast(0.0, ti.f64)
+    if spread > 0.0:
+        # Of half the angle whose cosine and sine are these over the spread, the larger one first.
+        larger = ti.sqrt(0.5 + 0.5 * ti.abs(half) / spread)
+        smaller = 0.5 * block[1, 2] / (spread * larger)
+        c, s = larger, smaller
+        if half < 0.0:
+            c, s = smaller, larger
     first, second = c * first + s * second, c * second - s * first
     along = Vector3(ti.max(start.dot(normal), 0.0), start.dot(first), start.dot(second))
     rubbing, limit = ti.sqrt(along[1] * along[1] + along[2] * along[2]), friction * along[0]
@@ -174,34 +176,41 @@ def gather_contact(
 
 
 @ti.func
+def larger_of(one: ti.f64, two: ti.f64) -> ti.f64:
+    """The larger of two numbers, in one instruction: `ti.max` asks besides whether one is none."""
+    return ti.select(one > two, one, two)
+
+
+@ti.func
 def friction_impulse(a_1: ti.f64, a_2: ti.f64, c_1: ti.f64, c_2: ti.f64, limit: ti.f64, start: ti.f64):
     """Tangential impulses x with slip w = A x + c: w = 0, or |x| = limit and w = -κ x with κ > 0; and κ.
 
-    The second solves (A + κ) x = -c; Newton's method on 1/limit = 1/|x(κ)|, which is nearly linear in κ and concave,
+    The second solves (A + κ) x = -c. Newton's method on 1/limit = 1/|x(κ)|, which is nearly linear in κ and concave,
     is below its root after a step from anywhere, and then approaches it (Conn, Gould & Toint 2000, "Trust-region
-    methods", 7.3). A is diagonal, its first number the larger one. κ is started from.
+    methods", 7.3). It does one step a sweep: x has the direction of the κ that is started from, and the length of the
+    limit; κ is that of the next sweep. A is diagonal, its first number the larger one.
     """
-    x_1, x_2, kappa = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), start
+    x_1, x_2, kappa = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     if limit > 0.0:
-        square, of_limit, is_found = ti.cast(0.0, ti.f64), limit * limit, False
-        rounding = ti.cast(FRICTION_ROUNDING, ti.f64) * of_limit
-        for _ in range(MAX_FRICTION_STEPS):
+        over = 1.0 / (a_1 * a_2)
+        x_1, x_2 = -c_1 * (a_2 * over), -c_2 * (a_1 * over)
+        square = x_1 * x_1 + x_2 * x_2
+        if square > limit * limit:
+            kappa = start
+            if start == 0.0:
+                # -x·dx/dκ = x·(A + κ)⁻¹x; and |x| is at least |c| over κ and the larger number of A.
+                fall = (a_2 * x_1 * x_1 + a_1 * x_2 * x_2) * over
+                kappa = (ti.sqrt(square) / limit - 1.0) * square / fall
+                kappa = larger_of(kappa, ti.sqrt(c_1 * c_1 + c_2 * c_2) / limit - a_1)
             d_1, d_2 = a_1 + kappa, a_2 + kappa
             over = 1.0 / (d_1 * d_2)
-            x_1, x_2 = -c_1 * d_2 * over, -c_2 * d_1 * over
+            x_1, x_2 = -c_1 * (d_2 * over), -c_2 * (d_1 * over)
             square = x_1 * x_1 + x_2 * x_2
-            if square <= of_limit + rounding and (kappa == 0.0 or square >= of_limit - rounding):
-                is_found = True
-                break
-            # -x·dx/dκ = x·(A + κ)⁻¹x
+            length = ti.sqrt(square)
             fall = (d_2 * x_1 * x_1 + d_1 * x_2 * x_2) * over
-            before, kappa = kappa, ti.max(kappa + (ti.sqrt(square) / limit - 1.0) * square / fall, 0.0)
-            if before == 0.0:
-                # From below as well: |x| is at least |c| over κ and the larger number of A.
-                kappa = ti.max(kappa, ti.sqrt(c_1 * c_1 + c_2 * c_2) / limit - a_1)
-        if not is_found:
-            scale = limit / ti.sqrt(square)
-            x_1, x_2 = scale * x_1, scale * x_2
+            kappa = larger_of(kappa + (length / limit - 1.0) * square / fall, 0.0)
+            x_1 *= limit / length
+            x_2 *= limit / length
     return x_1, x_2, kappa
 
 
@@ -249,11 +258,11 @@ def relax_pair(
         own = linear_one + angular_one.cross(arm_one) - linear_two - angular_two.cross(arm_two)
         ahead_n = ratio * work[at][AHEAD]
         old_n = work[at][IMPULSE] + ahead_n
-        new_n = ti.max(old_n - (own.dot(normal) - work[at][LEAST]) * work[at][OWN + 1], work[at][LOWEST])
+        new_n = larger_of(old_n - (own.dot(normal) - work[at][LEAST]) * work[at][OWN + 1], work[at][LOWEST])
         d_n = new_n - old_n
         work[at][AHEAD], work[at][CHANGE], work[at][IMPULSE] = ahead_n + work[at][CHANGE], d_n, new_n
         added = d_n * normal
-        largest = ti.max(largest, work[at][OWN] * ti.abs(d_n))
+        largest = larger_of(largest, work[at][OWN] * ti.abs(d_n))
         square += d_n * d_n
         if ti.static(rubs):
             ahead_1, ahead_2 = ratio * work[at][AHEAD + 1], ratio * work[at][AHEAD + 2]
@@ -269,7 +278,7 @@ def relax_pair(
                 new_1, new_2, kappa = friction_impulse(a_1, a_2, c_1, c_2, limit, work[at][SLIP])
                 work[at][SLIP] = kappa
                 d_1, d_2 = new_1 - old_1, new_2 - old_2
-                largest = ti.max(largest, a_1 * ti.abs(d_1), a_2 * ti.abs(d_2))
+                largest = larger_of(largest, larger_of(a_1 * ti.abs(d_1), a_2 * ti.abs(d_2)))
                 square += d_1 * d_1 + d_2 * d_2
                 added += d_1 * one_way + d_2 * other_way
             work[at][AHEAD + 1], work[at][AHEAD + 2] = (

@@ -17,8 +17,8 @@ from sim.rigid.contact_solver import FEWEST_ITERATIONS, MAX_ITERATIONS
 from sim.rigid.contacts import Array
 from sim.rigid.tables import kept, larger
 
-LOOKS = (0, *range(FEWEST_ITERATIONS, MAX_ITERATIONS + 1, 4))
-"""Sweeps before which the device is asked whether any island is not done."""
+LOOKS = tuple((0, *range(least, MAX_ITERATIONS + 1, 4)) for least in (FEWEST_ITERATIONS, FEWEST_ITERATIONS // 2))
+"""Sweeps of both solves before which the device is asked whether any island is not done."""
 
 
 class Pile:
@@ -81,7 +81,7 @@ class Pile:
         for solve in range(2):
             for sweep in range(limits.most + 1):
                 kernels.begin_sweeps(solve, sweep, pile, limits, self._alive)
-                if sweep in LOOKS and not copied(self._alive)[solve, sweep]:
+                if sweep in LOOKS[solve] and not copied(self._alive)[solve, sweep]:
                     break
                 kernels.relax_colour.repeat(colours, solve, near, contacts, pile)
             if solve == 0:

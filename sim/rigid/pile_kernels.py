@@ -345,6 +345,16 @@ def may_change_in(solve: ti.template(), island: ti.i32, pile: Pile, limits: Limi
 
 
 @func
+def most_in(solve: ti.template(), island: ti.i32, pile: Pile, limits: Limits) -> ti.i32:
+    """How many sweeps an island gets at most; half as many move it apart if it is worth fewer looks than it gets."""
+    most = ti.cast(pile.islands[island, MOST], ti.i32)
+    is_large = most < limits.most and pile.islands[island, CONTACTS] * most > limits.coarse_work
+    if ti.static(solve == 1) and is_large:
+        most = (most + 1) // 2
+    return most
+
+
+@func
 def begin_sweep(
     solve: ti.template(),
     sweep: ti.i32,
@@ -364,7 +374,8 @@ def begin_sweep(
         last, before_last = (sweep + 2) % 3, (sweep + 1) % 3
         was_done = sweep > 0 and pile.done[island, (sweep + 1) % 2] == 1
         is_small = sweep > 0 and number(pile.islands[island, LARGEST + last]) <= may_change
-        is_done = was_done or is_small or sweep >= pile.islands[island, MOST]
+        most = most_in(solve, island, pile, limits)
+        is_done = was_done or is_small or sweep >= most
         ratio = ti.cast(0.0, ti.f64)
         square, square_before = pile.islands[island, SQUARE + last], pile.islands[island, SQUARE + before_last]
         if sweep > 1:
@@ -387,7 +398,7 @@ def begin_sweep(
             if not is_done:
                 alive[solve, sweep] += 1
             elif not was_done:
-                pile.islands[island, TAKEN + solve] = ti.select(is_small, sweep, pile.islands[island, MOST] + 1)
+                pile.islands[island, TAKEN + solve] = ti.select(is_small, sweep, most + 1)
 
 
 @func
@@ -504,7 +515,7 @@ def relax_island(
         pile.spans[place, 1],
         pile.spans[place + 1, 1],
     )
-    may_change, most = may_change_in(solve, island, pile, limits), ti.cast(pile.islands[island, MOST], ti.i32)
+    may_change, most = may_change_in(solve, island, pile, limits), most_in(solve, island, pile, limits)
     taken, ratio, square_before = most + 1, ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     for sweep in range(most):
         for mover in range(begin_movers, end_movers):

@@ -36,6 +36,8 @@ CONVERGED = 1.0e-13  # of the square of the distance: by how much its bounds sti
 OVERLAP = 1.0e-14  # square of a distance, in that of the centres, below which sharp polytopes overlap
 SAME_GAP = 1.0e-6  # of the radius: gaps that differ by less are those of one point
 FLUSH = 1.0e-2  # of the radius: corners that are less far beyond an edge are not cut off
+SUBSETS = ((0, 0, 0), (0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, 0), (0, 2, 0), (1, 2, 0), (0, 1, 2))
+"""Members of the subsets of three, by the bits of the number of each, followed by anything."""
 VERTEX_BITS = 10
 NEAREST = ((1 << (FEATURE_BITS - WALL_BITS - VERTEX_BITS - 1)) - 1) << (VERTEX_BITS + 1)
 """Feature of the nearest points of two polytopes; others are vertices, or cut by the edge of a face."""
@@ -101,51 +103,61 @@ def least_behind(one: ti.i32, two: ti.i32, bodies: Bodies, polytopes: Polytopes)
 
 
 @ti.func
-def nearest_of_simplex(points: ti.template(), count: ti.i32):
-    """Weights of the point nearest to the origin of a simplex whose last point belongs to it, and its square distance.
+def row_at(rows: ti.template(), row: ti.template()) -> Vector3:
+    """A row of a matrix of three columns."""
+    return Vector3(rows[row, 0], rows[row, 1], rows[row, 2])
 
-    Of all subsets with the last of `count` points, which are four at most, the nearest one whose weights are positive.
+
+@ti.func
+def nearest_of_simplex(points: ti.template(), last: Vector3, count: ti.i32):
+    """Weights of the point nearest to the origin of a simplex, one point of which belongs to it; and its distance².
+
+    Of all subsets of so many points, which are three at most, and the last one, the nearest whose weights are positive;
+    weights are those of the points.
     """
-    last = Vector3(points[count - 1, 0], points[count - 1, 1], points[count - 1, 2])
-    weights, least = ti.Vector.zero(ti.f64, 4), ti.cast(FAR, ti.f64)
-    for mask in range(1 << (count - 1)):
-        place, edges, size = ti.Vector([0, 0, 0]), ti.Matrix.zero(ti.f64, 3, 3), 0
-        for j in range(count - 1):
-            if (mask >> j) & 1 == 1:
-                place[size] = j
-                for axis in ti.static(range(3)):
-                    edges[size, axis] = points[j, axis] - last[axis]
-                size += 1
-        e, f, g = edges[0, :], edges[1, :], edges[2, :]
-        s, t, u, holds = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), True
-        if size == 1:
-            s = -last.dot(e) / e.dot(e)
-        elif size == 2:
-            ee, ef, ff, le, lf = e.dot(e), e.dot(f), f.dot(f), last.dot(e), last.dot(f)
-            determinant = ee * ff - ef * ef
-            holds = determinant > 1.0e-14 * ee * ff
-            if holds:
+    weights, least = Vector3(0.0), ti.cast(FAR, ti.f64)
+    for subset in ti.static(range(8)):
+        if subset < 1 << count:
+            e = row_at(points, ti.static(SUBSETS[subset][0])) - last
+            f = row_at(points, ti.static(SUBSETS[subset][1])) - last
+            g = row_at(points, ti.static(SUBSETS[subset][2])) - last
+            s, t, u, holds = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), True
+            size = ti.static(bin(subset).count("1"))
+            if ti.static(size == 1):
+                s = -last.dot(e) / e.dot(e)
+            elif ti.static(size == 2):
+                ee, ef, ff, le, lf = e.dot(e), e.dot(f), f.dot(f), last.dot(e), last.dot(f)
+                determinant = ee * ff - ef * ef
+                holds = determinant > 1.0e-14 * ee * ff
+                determinant = ti.select(holds, determinant, 1.0)
                 s, t = (ef * lf - ff * le) / determinant, (ef * le - ee * lf) / determinant
-        elif size == 3:
-            determinant = e.dot(f.cross(g))
-            holds = ti.abs(determinant) > 1.0e-14 * e.norm() * f.norm() * g.norm()
-            if holds:
+            elif ti.static(size == 3):
+                determinant = e.dot(f.cross(g))
+                holds = ti.abs(determinant) > 1.0e-14 * e.norm() * f.norm() * g.norm()
+                determinant = ti.select(holds, determinant, 1.0)
                 s = -last.dot(f.cross(g)) / determinant
                 t, u = -e.dot(last.cross(g)) / determinant, -e.dot(f.cross(last)) / determinant
-        if holds and s >= 0.0 and t >= 0.0 and u >= 0.0 and s + t + u <= 1.0:
-            nearest = last + s * e + t * f + u * g
-            square = ti.select(size == 3, 0.0, nearest.dot(nearest))
-            if square < least:
-                least = square
-                weights = ti.Vector.zero(ti.f64, 4)
-                weights[count - 1] = 1.0 - s - t - u
-                if size > 0:
-                    weights[place[0]] = s
-                if size > 1:
-                    weights[place[1]] = t
-                if size > 2:
-                    weights[place[2]] = u
+            if holds and s >= 0.0 and t >= 0.0 and u >= 0.0 and s + t + u <= 1.0:
+                nearest = last + s * e + t * f + u * g
+                square = ti.cast(0.0, ti.f64) if ti.static(size == 3) else nearest.dot(nearest)
+                if square < least:
+                    least, weights = square, Vector3(0.0)
+                    if ti.static(size > 0):
+                        weights[ti.static(SUBSETS[subset][0])] = s
+                    if ti.static(size > 1):
+                        weights[ti.static(SUBSETS[subset][1])] = t
+                    if ti.static(size > 2):
+                        weights[ti.static(SUBSETS[subset][2])] = u
     return weights, least
+
+
+@ti.func
+def put_row(rows: ti.template(), place: ti.i32, row: Vector3):
+    """Put a row into a matrix of three columns."""
+    for each in ti.static(range(3)):
+        if each == place:
+            for axis in ti.static(range(3)):
+                rows[each, axis] = row[axis]
 
 
 @func
@@ -159,7 +171,7 @@ def nearest_points(first: ti.i32, second: ti.i32, within: ti.f64, bodies: Bodies
     way = vector_at(bodies.pose, first, 0) - vector_at(bodies.pose, second, 0)
     scale = way.dot(way)
     # Points of the difference of both, and the second body's part of them.
-    simplex, on_second = ti.Matrix.zero(ti.f64, 4, 3), ti.Matrix.zero(ti.f64, 4, 3)
+    simplex, on_second = ti.Matrix.zero(ti.f64, 3, 3), ti.Matrix.zero(ti.f64, 3, 3)
     count, square, apart, point = 0, ti.cast(FAR, ti.f64), ti.cast(0.0, ti.f64), Vector3(0.0)
     for _ in range(MOST_STEPS):
         there = farthest(way, second, bodies, polytopes)
@@ -171,30 +183,33 @@ def nearest_points(first: ti.i32, second: ti.i32, within: ti.f64, bodies: Bodies
         if count > 0 and square - along <= CONVERGED * square:
             break
         is_known = False
-        for j in range(count):
-            if simplex[j, 0] == added[0] and simplex[j, 1] == added[1] and simplex[j, 2] == added[2]:
+        for j in ti.static(range(3)):
+            if j < count and simplex[j, 0] == added[0] and simplex[j, 1] == added[1] and simplex[j, 2] == added[2]:
                 is_known = True
         if is_known:
             break
-        for axis in ti.static(range(3)):
-            simplex[count, axis], on_second[count, axis] = added[axis], there[axis]
-        weights, least = nearest_of_simplex(simplex, count + 1)
+        weights, least = nearest_of_simplex(simplex, added, count)
         if least >= square:
             break
         square = least
-        kept = 0
-        way, point = Vector3(0.0), Vector3(0.0)
-        for j in range(count + 1):
-            if weights[j] > 0.0:
-                for axis in ti.static(range(3)):
-                    simplex[kept, axis], on_second[kept, axis] = simplex[j, axis], on_second[j, axis]
-                    way[axis] += weights[j] * simplex[j, axis]
-                    point[axis] += weights[j] * on_second[j, axis]
-                kept += 1
-        count = kept
         if square <= OVERLAP * scale:
             way = Vector3(0.0)
             break
+        share = 1.0 - weights.sum()
+        way, point, kept = share * added, share * there, 0
+        for j in ti.static(range(3)):
+            if weights[j] > 0.0:
+                own, of_second = row_at(simplex, j), row_at(on_second, j)
+                way += weights[j] * own
+                point += weights[j] * of_second
+                put_row(simplex, kept, own)
+                put_row(on_second, kept, of_second)
+                kept += 1
+        if share > 0.0:
+            put_row(simplex, kept, added)
+            put_row(on_second, kept, there)
+            kept += 1
+        count = kept
     return apart, way, point
 
 
