@@ -331,6 +331,7 @@ def _couple_smokes(
 ) -> list[Coupling]:
     """Each smoke with what is in its way, which is put there, and with what hangs in it."""
     couplings: list[Coupling] = []
+    on_bodies: list[Coupling] = []  # after all that the air of any smoke does to bodies
     moving = [body for body in scene.rigid if body.kind != "static"]
     for number, smoke in enumerate(smokes):
         solids = [] if rigid is None else rigid.solids
@@ -346,6 +347,6 @@ def _couple_smokes(
         if smoke.free_bodies is not None:
             smoke.give_way(smoke.free_bodies)
         follows = any(source.follow is not None for source in smoke.parameters.source)
-        in_the_way += [SmokeSourcesOnBodies(rigid, smoke)] if rigid is not None and follows else []
+        on_bodies += [SmokeSourcesOnBodies(rigid, smoke)] if rigid is not None and follows else []
         couplings += [*in_the_way, *(SmokeClothCoupling(cloth, smoke, number=number) for cloth in cloths)]
-    return couplings
+    return [*couplings, *on_bodies]

@@ -24,7 +24,6 @@ class SmokeSourcesOnBodies(Coupling):
 
     The smoke takes its own steps; before each, bodies go ahead to its end, and a source emits all along the way of its
     body in the step. One way: what it blows out does not push the body.
-
     """
 
     is_loose = True
@@ -46,10 +45,14 @@ class SmokeSourcesOnBodies(Coupling):
         for number, motion in self._sources:
             motion.carry(self._body(number), begin_s, begin_s + dt)
 
+    def follow(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
+        """As `resume`, so that a run that goes on knows as much as one that begins from a checkpoint."""
+        self.resume()
+
     def resume(self) -> None:
-        """Sources are where their bodies are now."""
+        """Sources are where their bodies are now, and move as these do."""
         for number, motion in self._sources:
-            motion.stay(self._body(number))
+            motion.go_on(self._body(number), self._smoke.time_s)
 
     def _body(self, number: int) -> Motion:
         """Of the shape's origin, which is not the centre of mass."""

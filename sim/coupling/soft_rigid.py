@@ -64,7 +64,7 @@ class SoftRigidCoupling(Coupling):
 
     def __init__(self, soft: SoftSolver, rigid: RigidSolver, contacts: BodyContacts) -> None:
         self.bodies = (soft.name, rigid.name)
-        self._contacts, self._rigid = contacts, rigid
+        self._contacts, self._rigid, self._own_friction = contacts, rigid, soft.parameters[0].friction
         self.resume()
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
@@ -78,6 +78,7 @@ class SoftRigidCoupling(Coupling):
 
     def resume(self) -> None:
         """As `follow`."""
+        self._contacts.rub(np.sqrt(self._own_friction * self._rigid.surfaces.friction))
         rigid, bodies, glue = self._rigid, self._rigid.bodies, self._rigid.glue
         motion = bodies.position, bodies.rotation(), bodies.velocity, bodies.angular_velocity
         together = None if glue is None else (glue.leader, glue.movers.position[glue.leader])

@@ -43,9 +43,12 @@ class AirAround(Protocol):
 
     Attributes:
         cell_size: scale over which it changes [m].
+        low, high: ends of the room [m], (3,); far away where nothing ends it.
     """
 
     cell_size: float
+    low: ti.math.vec3
+    high: ti.math.vec3
 
     def find(self, position: ti.Ndarray, velocity: ti.Ndarray, is_stuck: ti.Ndarray) -> None:
         """Velocity of the air at positions now [m/s], (n, 3), and where something stops what flies, (n,)."""
@@ -140,7 +143,8 @@ class EmberSolver:
         """Advance by dt [s]."""
         self._air.find(self.embers.position, self._wind, self._is_stuck)
         pull = 0.75 * AIR_DENSITY / self.parameters.density
-        _fly(self.embers, self._wind, self._is_stuck, ti.math.vec3(self.gravity), pull, dt)
+        ends = self._air.low, self._air.high
+        _fly(self.embers, self._wind, self._is_stuck, *ends, ti.math.vec3(self.gravity), pull, dt)
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Embers that glow, in the order in which they came."""
@@ -193,7 +197,16 @@ def _places_in(solid: "PlacedSolid", chance: np.random.Generator) -> NDArray[np.
 
 
 @kernel
-def _fly(embers: Embers, air: Vectors, is_stuck: Integers, gravity: ti.math.vec3, pull: ti.f32, dt: ti.f32):
+def _fly(
+    embers: Embers,
+    air: Vectors,
+    is_stuck: Integers,
+    low: ti.math.vec3,
+    high: ti.math.vec3,
+    gravity: ti.math.vec3,
+    pull: ti.f32,
+    dt: ti.f32,
+):
     for i in range(embers.age.shape[0]):
         step = ti.min(dt, embers.age[i] + dt)  # those that come within the step fly for the rest of it
         if embers.number[i] >= 0 and step > 0.0 and embers.age[i] < embers.life[i]:
@@ -205,5 +218,8 @@ def _fly(embers: Embers, air: Vectors, is_stuck: Integers, gravity: ti.math.vec3
                 rate = pull * drag_coefficient(reynolds) * speed / embers.diameter[i]
                 gained = embers.velocity[i] + step * (gravity + rate * air[i])
                 embers.velocity[i] = gained / (1.0 + step * rate)
-                embers.position[i] += step * embers.velocity[i]
+                there = embers.position[i] + step * embers.velocity[i]
+                embers.position[i] = ti.min(ti.max(there, low), high)
+                if (there < low).any() or (there > high).any():
+                    embers.velocity[i] = ti.math.vec3(0.0)
         embers.age[i] += dt

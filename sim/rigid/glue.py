@@ -152,13 +152,16 @@ class Glue:
         return led, self.leader[led]
 
     def weigh(self) -> None:
-        """Find what holds together, and its masses, of what is not broken and of the pieces' masses."""
+        """Find what holds together by what is not broken, and its masses by those of the bodies."""
         holds, n = ~self.is_broken, len(self.leader)
         groups = groups_of(self.faces.first[holds], self.faces.second[holds], n)
         lowest = np.full(n, n)
         np.minimum.at(lowest, groups, np.arange(n))
         self.leader, self._known = lowest[groups], {}
         mass, tensors = self._bodies.mass, self._bodies.tensors
+        alone = self._bodies.is_dynamic & ~self._is_piece
+        for body in np.flatnonzero(alone & (self.movers.mass != mass)):
+            self.movers.set_inertia(int(body), float(mass[body]), tensors[body])
         pieces = np.flatnonzero(self._is_piece)
         for leader in np.unique(self.leader[pieces]):
             mine = pieces[self.leader[pieces] == leader]
@@ -214,7 +217,8 @@ class Glue:
     def share(self) -> None:
         """Let all that a body is glued to take part in pushes that it got, at once."""
         bodies = self._bodies
-        bodies.wake(np.bincount(self.leader, weights=~bodies.is_asleep)[self.leader] > 0.0)
+        beside = np.bincount(self.leader, weights=~bodies.is_asleep)[self.leader] > 0.0
+        bodies.wake(bodies.is_asleep & beside)
         self.gather()
         self.scatter()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -116,6 +116,8 @@ class RigidSolver:
             number: solid.deformation for number, solid in enumerate(self.solids) if solid.deformation is not None
         }
         self._animated = {n for n, body in enumerate(parameters) if body.shape.type == "animation"}
+        has_pieces = any(body.whole is not None for body in parameters)
+        self.glue = Glue(parameters, self.solids, self.bodies) if has_pieces else None
         self._place_kinematic_bodies(0.0)
 
         fixed = _geometries_of(obstacles)
@@ -136,8 +138,6 @@ class RigidSolver:
         corners = np.array([domain.min, domain.max])
         self._chooser = StepChooser(self.all_geometries, self.bodies, self.walls, self._detector, self.gravity)
         self.joints = Joints(joints, everybody, self.bodies, points) if joints else None
-        has_pieces = any(body.whole is not None for body in parameters)
-        self.glue = Glue(parameters, self.solids, self.bodies) if has_pieces else None
         self._obey_links()
         self.surroundings = Surroundings(self.bodies, self.solids, self.glue)
         self.has_own_steps = False
@@ -227,7 +227,11 @@ class RigidSolver:
             self.surroundings.push(self.gravity, dt)
         if bodies.is_dynamic.any() and self.first_bad_quantity() is None:
             awake = self._awake(dt)
-            for count, is_active in self._chooser.divided(self.poses(), dt, awake):
+            groups = self._chooser.divided(self.poses(), dt, awake)
+            if len(groups) > 1 and self.joints is not None and len(self.joints.points):
+                # Points of cloth move in each step, so that all bodies take the same ones.
+                groups = [(max(count for count, _ in groups), np.any([which for _, which in groups], axis=0))]
+            for count, is_active in groups:
                 self._place_kinematic_bodies(start_s)
                 for step in range(count):
                     self._advance(dt / count, start_s + step * (dt / count), is_active)
@@ -288,6 +292,8 @@ class RigidSolver:
             friction = self.surfaces.of_pairs(*pieces)[0]
             broken = glue.overloaded(contacts, pieces, friction, outcome.impulses, unstopped, dt, everybody)
             if len(broken) and rounds > 0:
+                if joints is not None and points is not None:
+                    joints.points.set_state(points)
                 bodies.velocity, bodies.angular_velocity = velocities
                 glue.scatter()
                 glue.split(broken)
@@ -305,8 +311,6 @@ class RigidSolver:
                     glue.scatter()
                 self._advance(dt, time_s, everybody, halvings, rounds, np.maximum(reach, got), looks - 1)
                 return
-        if glue is not None:
-            glue.settle()
         self._contact_count = self._detector.active_count()
         self._iterations += outcome.iterations
         self._not_converged += not outcome.converged
@@ -328,9 +332,13 @@ class RigidSolver:
                 joints.points.set_state(points)
                 bodies.position, bodies.orientation = before
                 bodies.velocity, bodies.angular_velocity = velocities
+                if glue is not None:
+                    glue.scatter()
                 for half in range(2):
                     self._advance(0.5 * dt, time_s + half * 0.5 * dt, everybody, halvings - 1)
                 return
+        if glue is not None:
+            glue.settle()
 
         # One that a fluid pushed is touched as well: the fluid is to see how it moves.
         bodies.is_pushed = bodies.is_pushed & ~is_active
@@ -346,6 +354,8 @@ class RigidSolver:
         if joints is not None and hold is not None:
             broken = int(joints.is_broken.sum())
             joints.settle(hold, bodies, is_active, bodies.inverse_inertia())
+            if glue is not None:
+                glue.scatter()
             if int(joints.is_broken.sum()) > broken:
                 self._obey_links()
 
@@ -518,12 +528,20 @@ class RigidSolver:
         for number, path in self.paths.items():
             motion = path.at(time_s)
             arm = rotation.rotated(motion.orientation, self.solids[number].centre_of_mass)
-            self.bodies.position[number] = motion.position + arm
-            self.bodies.orientation[number] = motion.orientation
-            self.bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
-            self.bodies.angular_velocity[number] = motion.angular_velocity
+            for bodies in self._both:
+                bodies.position[number] = motion.position + arm
+                bodies.orientation[number] = motion.orientation
+                bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
+                bodies.angular_velocity[number] = motion.angular_velocity
         for number, deformation in self.deforming.items():
             self.bodies.deforming[number] = deformation.speed(time_s)
+
+    @property
+    def _both(self) -> Iterator[MovingBodies]:
+        """The bodies, and those that move on their own where some are glued."""
+        yield self.bodies
+        if self.glue is not None:
+            yield self.glue.movers
 
     def _set_mean_velocities_of_kinematic_bodies(self, time_s: float, dt: float) -> None:
         """Contacts see how kinematic bodies will have moved by the end of the step of dt [s] from a time [s] on."""
@@ -540,11 +558,10 @@ class RigidSolver:
         if lost.any():
             if self.glue is not None:
                 lost = np.bincount(self.glue.leader, weights=lost)[self.glue.leader] > 0.0
-                self.glue.movers.is_lost |= lost
-            self.bodies.is_lost |= lost
             self.surroundings.forget(lost)
-            self.bodies.velocity[lost] = 0.0
-            self.bodies.angular_velocity[lost] = 0.0
+            for bodies in self._both:
+                bodies.is_lost |= lost
+                bodies.velocity[lost] = bodies.angular_velocity[lost] = 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
         """The pose of each body's own mesh at rest, and the velocity of the mesh's origin; of one that a file animates

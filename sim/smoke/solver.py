@@ -128,6 +128,11 @@ class SmokeSolver:
             self.begin_frame(0.0)
         self.guide = guide
 
+    @property
+    def outside_velocity(self) -> Vector3:
+        """Velocity of the air outside of the grid [m/s]."""
+        return self._outside.velocity
+
     def _compute_in_grid(self) -> None:
         """Have room for air at rest in the grid, and all that changes it."""
         parameters = self.parameters

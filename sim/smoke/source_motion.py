@@ -26,6 +26,7 @@ COSTLY_SHAPES = (DuckShape, BunnyShape, MeshShape)  # their distances take long,
 LOOKUPS_PER_CELL = 4.0  # nodes of such a table along the edge of a cell
 ROUND_OFF = 1.0e-9  # of ways and distances, in parts of them and in cells, at most
 ROUNDING = 2.0**-16  # of covered parts, so that what is symmetric stays so
+AHEAD_S = 1.0e-3  # of a body's way, by which it is told how it goes on [s]
 PARTS = 4  # points along the edge of a cell at which it is asked how much of it is covered
 CELLS = 3  # stands for cells where the axis of faces is asked for
 
@@ -70,22 +71,22 @@ class BodyMotion:
         """Take the source's origin from that of the body's shape [m], (3,), its turn, (4,), and its reach [m]."""
         self._offset, self._orientation = offset, orientation
         self._arm = reach + float(np.linalg.norm(offset))
-        self.stay(Motion(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3)))
+        self.go_on(Motion(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3)), 0.0)
 
-    def stay(self, body: Motion) -> None:
-        """The body is here: at the start, or where a run continues."""
-        self._times, self._begin, self._end = (0.0, 0.0), body, body
+    def go_on(self, body: Motion, time_s: float) -> None:
+        """The body is here at a time [s], between two steps; until it is told otherwise it goes on as it moves."""
+        turned = rotation.product(rotation.exponential(AHEAD_S * body.angular_velocity), body.orientation)
+        ahead = body._replace(position=body.position + AHEAD_S * body.velocity, orientation=turned)
+        self._times, self._begin, self._end, self._here = (time_s, time_s + AHEAD_S), body, ahead, body
 
     def carry(self, body: Motion, begin_s: float, end_s: float) -> None:
         """In the coming step of the smoke, from one time to another [s], the body gets here."""
-        self._times, self._begin, self._end = (begin_s, end_s), self._end, body
+        self._times, self._begin, self._end, self._here = (begin_s, end_s), self._here, body, body
 
     def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
         """See `SourceMotion`."""
         (leg_begin_s, leg_end_s), begin, end = self._times, self._begin, self._end
         duration = leg_end_s - leg_begin_s
-        if duration <= 0.0:
-            return [self._on(end)]
         turn = rotation.logarithm(rotation.product(end.orientation, rotation.conjugate(begin.orientation)))
         step = end.position - begin.position
         length = (float(np.linalg.norm(step)) + self._arm * float(np.linalg.norm(turn))) * (end_s - begin_s) / duration
@@ -102,8 +103,8 @@ class BodyMotion:
         return poses
 
     def speed(self) -> float:
-        """At the end of the last step [m/s]."""
-        body = self._end
+        """Where the body was last [m/s]."""
+        body = self._here
         return float(np.linalg.norm(body.velocity)) + self._arm * float(np.linalg.norm(body.angular_velocity))
 
     def _on(self, body: Motion) -> Motion:

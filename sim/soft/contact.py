@@ -97,7 +97,7 @@ class BodyContacts:
         wholes: Sequence[BodyGeometry] = (),
         whole_of: NDArray[np.int64] | None = None,
     ) -> None:
-        self._moving, self._mass = moving, mass
+        self._moving, self._mass, self._friction = moving, mass, np.array(friction, np.float32)
         self._shapes = MovingShapes([*geometries, *wholes])
         count, shown = len(geometries), len(geometries) + len(wholes)
         self._radius = copied(self._shapes.shapes.radius).astype(np.float64)[:count]
@@ -114,7 +114,7 @@ class BodyContacts:
             count,
             shapes.radius,
             shapes.step,
-            on_device(np.array(friction, np.float32)),
+            on_device(self._friction),
             bool(wholes),
             on_device(np.arange(count, dtype=np.int32)),
             ti.Vector.ndarray(3, ti.f32, count),
@@ -127,6 +127,13 @@ class BodyContacts:
             mass,
             1.0,
         )
+
+    def rub(self, friction: Float64Array) -> None:
+        """Take another friction against bodies [-], (bodies,); against those that soft matter sticks to it stays."""
+        rubs = np.where(self._friction < STICKS, friction, STICKS).astype(np.float32)
+        if not np.array_equal(rubs, self._friction):
+            self._friction = rubs
+            put(self._touching.friction, rubs)
 
     def stand(self, position: Float64Array, rotation: Float64Array) -> None:
         """Place the last bodies, which never move, (k, 3) and (k, 3, 3)."""

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from thread_counts import digest_of
 
 from sim.build import build_world
 from sim.core.domain import DomainParameters
@@ -63,9 +64,39 @@ def test_a_source_is_where_its_body_takes_it_and_as_fast_as_that_place():
     ways = np.linalg.norm(np.diff([pose.position for pose in poses], axis=0), axis=1)
     assert len(poses) > 10
     assert ways.max() < 0.01
+    # From there it goes on as the body moves.
+    smoke.time_s = dt
     coupling.resume()
-    (rest,) = motion.poses(dt, 2.0 * dt, spacing=0.01)
-    assert rest.position == pytest.approx(poses[-1].position, abs=1e-12)
+    here, *ahead = motion.poses(dt, 2.0 * dt, spacing=0.01)
+    assert here.position == pytest.approx(poses[-1].position, abs=1e-12)
+    arm = (Rotation.from_rotvec(2.0 * dt * spin) * start).apply(EXHAUST["position"])
+    assert ahead[-1].position == pytest.approx(np.array(CAR["position"]) + 2.0 * dt * velocity + arm, abs=1e-9)
+
+
+@pytest.mark.parametrize("grid", ["window", "box"])
+def test_a_run_that_goes_on_has_the_bits_of_one_that_was_restored(grid, taichi_cpu):
+    """A window around an exhaust that a body takes along, and one that blows on a body that the air slows."""
+    led = {"kind": "kinematic", "velocity": (3.0, 0.0, 0.0)}
+    free = {"kind": "dynamic", "density": 3.0, "velocity": (1.0, 0.0, 0.0)}
+    ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.15}, "position": (0.8, 0.8, 0.8)}
+    source = {"shape": {"type": "sphere", "radius": 0.2}, "temperature": 293.0, "follow": "ball"}
+    blows = {} if grid == "window" else {"velocity": (0.0, 0.0, 0.5)}
+    faces = ("x-", "x+", "y-", "y+", "z-", "z+")
+    air = {"name": "air", "cell_size": 0.1, "open_faces": faces, "grid": grid, "source": ({**source, **blows},)}
+    scene = SceneParameters(
+        domain={"min": (0.0, 0.0, 0.0), "max": (4.8, 1.6, 1.6), "open_faces": faces},
+        gravity=(0.0, 0.0, 0.0),
+        smoke=(air,),
+        rigid=({**ball, **(led if grid == "window" else free)},),
+    )
+    goes_on, restored = (build_world(scene, frames_per_second=24) for _ in range(2))
+    for frame in range(1, 9):
+        goes_on.advance_frame()
+        kept = {name: array.copy() for name, array in goes_on.checkpoint().items()}
+        if frame > 1:
+            assert digest_of(kept) == digest_of(restored.checkpoint())
+        restored.restore(frame, kept)
+        restored.advance_frame()
 
 
 def test_a_source_on_a_static_body_is_placed_with_it():

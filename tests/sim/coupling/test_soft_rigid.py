@@ -134,3 +134,18 @@ def test_nothing_gets_into_a_body_that_stands_or_is_led(kind):
         top = world.snapshots()["table"].arrays["position"][2] + 0.05
         assert place[:, 2].min() > top - 0.01  # half a cell
     assert world.solvers["soft"].diagnostics()["max_speed"] < 3.0
+
+
+@pytest.mark.parametrize("is_greased", [False, True])
+def test_a_body_that_is_greased_between_frames_lets_jelly_slide(is_greased):
+    table = {"name": "table", "shape": {"type": "box", "size": (1.2, 0.6, 0.1)}, "position": (0.0, 0.0, -0.15)}
+    block = {"shape": {"type": "box", "size": (0.2, 0.2, 0.2)}, "velocity": (1.0, 0.0, 0.0), "position": (-0.3, 0, 0)}
+    table |= {"kind": "kinematic", "friction": 0.8}
+    jelly = JELLY | {"block": [block], "friction": 0.8}
+    world = world_of(gravity=(0.0, 0.0, -9.81), soft=[jelly], rigid=[table])
+    if is_greased:
+        world.solvers["rigid"].set_surface("table", friction=0.0)
+    for _ in range(9):
+        world.advance_frame()
+    speed = world.snapshots()["jelly"].arrays["velocity"][:, 0].mean()
+    assert speed == pytest.approx(1.0, abs=0.02) if is_greased else speed < 0.5

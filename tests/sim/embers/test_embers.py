@@ -14,20 +14,22 @@ pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
 FPS = 60
 HALL = {"min": (-0.5, -0.5, 0.0), "max": (0.5, 0.5, 1.0)}
+OPEN = ("x-", "x+", "y-", "y+", "z+")
 
 
-def world(*, source=(), smoke=(), rigid=(), **embers):
+def world(*, source=(), smoke=(), rigid=(), gravity=(0.0, 0.0, -9.81), domain=(), **embers):
     place = {"shape": {"type": "sphere", "radius": 0.05}, "position": (0.0, 0.0, 0.5), "rate": 300.0, "spread": 0.0}
     still = {"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.5)}
     air = {
         "name": "air",
         "cell_size": 0.05,
-        "open_faces": ("x-", "x+", "y-", "y+", "z+"),
+        "open_faces": OPEN,
         "source": ({**still, "temperature": 293.0, "density": 0.0},),
         **dict(smoke),
     }
     scene = SceneParameters(
-        domain={**HALL, "open_faces": ("x-", "x+", "y-", "y+", "z+")},
+        domain=domain or {**HALL, "open_faces": OPEN},
+        gravity=gravity,
         smoke=(air,),
         rigid=rigid,
         embers=({"name": "sparks", "smoke": "air", "source": ({**place, **dict(source)},), **embers},),
@@ -58,6 +60,37 @@ def test_in_still_air_they_fall_at_the_terminal_speed_of_their_size():
     assert len(expected) == 30
     np.testing.assert_allclose(-found["velocity"][:, 2], expected, rtol=2e-3)
     assert np.ptp(expected) > 0.1
+
+
+def test_they_come_to_rest_on_the_floor_and_not_below_it():
+    found = after(world(source={"end_s": 0.1}, lifetime=4.0, density=200.0, diameter=0.003), 60)
+    assert not found["velocity"].any()
+    assert found["position"][:, 2].min() == found["position"][:, 2].max() == 0.0
+
+
+@pytest.mark.parametrize("grid", ["box", "window", "open"])
+def test_outside_of_a_window_the_wind_goes_on(grid):
+    """Air that leaves the box of a smoke is at rest, what a window of it leaves out is not."""
+    found = after(
+        world(
+            smoke={"wind": (2.0, 0.0, 0.0), "grid": grid, "cell_size": 0.1},
+            source={"end_s": 0.02, "position": (-0.4, 0.0, 0.5), "velocity": (2.0, 0.0, 0.0)},
+            gravity=(0.0, 0.0, 0.0),
+            domain={"min": (-0.5, -0.5, 0.0), "max": (3.5, 0.5, 1.0)},
+            lifetime=4.0,
+            density=10.0,
+            diameter=0.0003,
+        ),
+        90,
+    )
+    assert found["velocity"][:, 0] == pytest.approx(2.0, abs=0.1)
+
+
+def test_sides_that_are_open_to_the_smoke_let_them_out():
+    """Although the domain, whose walls are for fluids, is closed there."""
+    source = {"end_s": 0.1, "position": (0.4, 0.0, 0.5), "velocity": (3.0, 0.0, 1.0)}
+    found = after(world(source=source, domain=HALL, lifetime=4.0, density=200.0, diameter=0.003), 30)
+    assert found["position"][:, 0].min() > 0.6
 
 
 def test_an_even_wind_carries_them_at_its_speed():

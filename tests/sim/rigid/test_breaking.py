@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -9,6 +11,7 @@ from rigid_scenes import SPACE, advance, ball, body, cube, in_room, in_space, to
 
 from sim.rigid.groups import with_groups
 from sim.rigid.joint_parameters import JointParameters, joint_problems
+from sim.rigid.joint_points import JointPoints
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import start_problems
@@ -315,3 +318,106 @@ def test_loads_that_cannot_be_shared_are_as_the_contacts_have_them_and_are_count
     told = solver.diagnostics()
     assert told["loads_not_shared"] > 0.0
     assert told["faces_broken"] > 0.0
+
+
+# --- what is not glued, beside what is ---
+
+
+def beside_a_beam(is_there: bool, *others: RigidBodyParameters, **keys) -> RigidSolver:
+    """Bodies in free space, with one that breaks far away, or without it; they are the last."""
+    far = beam(2, strength=1e9, position=(0.0, 0.0, 3.0)) if is_there else []
+    return RigidSolver([*far, *others], domain=SPACE, **{"gravity": (0.0, 0.0, 0.0), **keys})
+
+
+def joint_of(**keys) -> JointParameters:
+    return JointParameters.model_validate({"name": "joint", **keys})
+
+
+@pytest.mark.parametrize("kind", ["spring", "ball"])
+def test_joints_move_a_body_alike_beside_one_that_could_break(kind):
+    anchors = ((1.3, -1.0, 1.2), (1.0, -1.0, 1.2))
+    spring = {"anchors": anchors, "stiffness": 50.0, "length": 0.2}
+    joint = joint_of(kind=kind, between=("link",), **(spring if kind == "spring" else {"anchor": anchors[1]}))
+    found = []
+    for is_there in (False, True):
+        solver = beside_a_beam(is_there, body("link", cube(EDGE), anchors[0]), joints=[joint], gravity=(0, 0, -9.81))
+        for _ in range(300):
+            solver.substep(1e-3)
+        found.append([solver.bodies.position[-1], solver.bodies.velocity[-1]])
+    assert np.allclose(found[0], found[1], rtol=0.0, atol=1e-9)
+
+
+def test_a_step_that_joints_halve_pushes_each_body_once(monkeypatch):
+    link = body("link", cube(0.05), (1.0, -1.0, 1.0))
+    joint = joint_of(kind="ball", between=("link",), anchor=(1.0, -1.0, 1.2))
+    solver = beside_a_beam(True, body("free", cube(EDGE), (0, 1, 3)), link, joints=[joint], gravity=(0, 0, -9.81))
+    hold, calls = solver.joints.hold, []
+
+    def too_long_at_first(*args, **keys):
+        calls.append(1)
+        return replace(hold(*args, **keys), is_too_long=len(calls) == 1)
+
+    monkeypatch.setattr(solver.joints, "hold", too_long_at_first)
+    solver.substep(2e-3)
+    assert len(calls) == 3
+    assert solver.bodies.velocity[:3, 2] == pytest.approx(-9.81 * 2e-3, rel=1e-9)
+
+
+def test_a_body_that_gets_heavier_beside_one_that_could_break_keeps_its_momentum():
+    hits = body("hits", cube(EDGE), (0.0, 1.0, 1.0), velocity=(1.0, 0.0, 0.0))
+    solver = beside_a_beam(True, hits, body("is_hit", cube(EDGE), (0.11, 1.0, 1.0)))
+    solver.scale_mass("hits", 10.0)
+    before = totals(solver, "momentum")
+    for _ in range(30):
+        solver.substep(1e-3)
+    assert solver.bodies.velocity[-1, 0] > 0.5
+    assert totals(solver, "momentum") == pytest.approx(before, abs=1e-9)
+
+
+@pytest.mark.parametrize("happens", ["breaks", "groups"])
+def test_points_of_cloth_are_pushed_once_in_a_step(happens, monkeypatch):
+    """Also where something breaks in it, and where bodies take other numbers of steps."""
+    points = JointPoints(np.full((1, 2), -1), np.array([[-1.0, -1.0, 1.0]]), np.zeros((1, 3)), np.array([0.1]))
+    joint = joint_of(kind="ball", between=("link",), anchor=(1.0, -1.0, 1.2))
+    fast = body("fast", ball(0.05), (0.0, 0.0, 2.0), velocity=(14.0, 0.0, 0.0))
+    others = (fast, body("in_its_way", cube(EDGE), (0.13, 0.0, 2.0)), body("link", cube(0.05), (1.2, -1.0, 1.2)))
+    solver = beside_a_beam(True, *others, joints=[joint], points=points, gravity=(0, 0, -9.81))
+    points.acceleration[:] = (0.0, 0.0, -9.81)
+    dt = solver.stable_dt()
+    if happens == "breaks":
+        found, overloaded = iter([np.array([0])]), solver.glue.overloaded
+        monkeypatch.setattr(
+            solver.glue, "overloaded", lambda *args: (overloaded(*args), next(found, np.zeros(0, dtype=int)))[1]
+        )
+    else:
+        solver.bodies.velocity[2] = (42.0, 0.0, 0.0)
+    solver.substep(dt)
+    assert broken(solver) == ([0] if happens == "breaks" else [])
+    assert points.velocity[0, 2] == pytest.approx(-9.81 * dt, rel=1e-9)
+
+
+def test_bodies_sleep_beside_one_that_could_break_though_something_pushes():
+    slab = beam(2, strength=1e9, position=(0.0, 0.0, 0.5 * EDGE))
+    solver = in_room(*slab, body("cube", cube(EDGE), (0.0, 0.5, 0.5 * EDGE), density=DENSITY))
+    nothing = np.zeros((3, 3))
+    for _ in range(400):
+        solver.apply_impulses(nothing, nothing)
+        solver.substep(2e-3)
+    assert solver.bodies.is_asleep.all()
+
+
+def test_what_flies_out_of_sight_as_pieces_stops_for_good():
+    lost = beam(2, strength=1e12, position=(0.0, 0.0, 3.0), velocity=(3000.0, 0.0, 0.0))
+    solver = RigidSolver([*lost, body("near", cube(EDGE), (0, 1, 1))], domain=SPACE, gravity=(0, 0, -1e-3))
+    for _ in range(60):
+        solver.substep(1e-3)
+    assert solver.bodies.is_lost.tolist() == [True, True, False]
+    assert not solver.bodies.velocity[:2].any()
+
+
+def test_bodies_that_are_led_are_where_others_see_them_beside_what_could_break():
+    way = [{"time_s": 0.0, "position": (0.0, 1.0, 1.0)}, {"time_s": 1.0, "position": (1.0, 1.0, 1.0)}]
+    solver = beside_a_beam(True, body("led", cube(EDGE), way[0]["position"], kind="kinematic", keyframe=way))
+    for _ in range(3):
+        solver.substep(0.01)
+    assert np.array_equal(solver.glue.movers.position[-1], solver.bodies.position[-1])
