@@ -208,6 +208,21 @@ def test_what_is_read_of_a_frame_is_what_was_written(tmp_path):
         assert np.array_equal(groups["brick_2"]["position"][()], written["brick_2"].arrays["position"])
 
 
+def test_pieces_of_a_group_are_read_by_their_names(tmp_path):
+    vases = BRICKS.replace('"brick"', '"vase"').replace("[4, 1, 3]", "2").replace("[0.1, 0.05, 0.04]\n", "0.3\n", 2)
+    vases = vases.replace("size = 0.3", "size = [0.1, 0.05, 0.04]") + "breaks = { strength = 1e9, pieces = 3 }\n"
+    scene = Scene(job_of(tmp_path, ROOM + vases + BALL))
+    scene.step()
+    scene.write(tmp_path / "frame.h5")
+    written, read = scene.bodies(), read_frame(tmp_path / "frame.h5").bodies
+    assert [*read] == ["ball", *(f"vase_{body}_{piece}" for body in (1, 2) for piece in (1, 2, 3))]
+    for name, snapshot in written.items():
+        assert not read[name].attributes
+        assert np.array_equal(read[name].arrays["position"], snapshot.arrays["position"])
+    with h5py.File(tmp_path / "frame.h5") as file:
+        assert sorted(file["bodies"]) == ["ball", "vase"]
+
+
 def test_the_library_takes_the_name_of_a_group(tmp_path):
     scene = Scene(job_of(tmp_path, ROOM + BRICKS.replace("0.02]", "0.3]") + BALL))
     assert scene.view("brick")["position"].shape == (12, 3)
