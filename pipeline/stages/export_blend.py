@@ -79,7 +79,7 @@ class BlendExport(_SceneExport):
     """The scene, and of each frame the fluids as they are drawn; all else it plays are the job's own files."""
 
     format = "blend"
-    version = 2
+    version = 3
     about = "the scene for Blender"
     opened_by = "open {file} in Blender 4.5 LTS or later; it plays the files beside it"
 
