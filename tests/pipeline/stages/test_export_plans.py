@@ -165,6 +165,14 @@ def test_what_copies_points_into_its_own_files_reads_the_drops_of_every_frame(na
     assert "drops" not in EXPORTS[name].refers_to
 
 
+def test_paraview_has_surfaces_of_soft_matter_and_says_that_it_has_no_grains():
+    frame = exported(HEAPS, "export-vtk")["export-vtk/000001"]
+    assert "soft/lump/000001.ply" in frame.inputs
+    assert not [each for each in frame.inputs if each.startswith("soft/heap")]
+    assert {Path(each).parts[1] for each in frame.outputs} == {"lump", "lump.surface", "heap", "000001.vtm"}
+    assert EXPORTS["vtk"].left_out(job_of_text(HEAPS, Path("job.toml"))) == ["grains (heap)"]
+
+
 def test_gltf_says_that_it_has_no_drops():
     told = EXPORTS["gltf"].left_out(job_of_text(SPLASH, Path("job.toml")))
     assert told == ["drops (water)", "whitewater (water)"]
