@@ -16,7 +16,7 @@ from blender_scripts.ply import KINDS, drawn_radii
 from blender_scripts.ply import read_points as read_rows
 from blender_scripts.shading import NodeBuilder
 
-_ATTRIBUTES = {"dye": DYE, "temperature": EMBER_TEMPERATURE}
+ATTRIBUTES = {"dye": DYE, "temperature": EMBER_TEMPERATURE}
 """Attributes of the columns that some clouds have."""
 
 
@@ -51,7 +51,7 @@ def read_points(path: Path, kind: str) -> Points:
         positions=np.stack([chosen[name] for name in ("x", "y", "z")], axis=1).astype(np.float32),
         velocities=np.stack([chosen[name] for name in ("vx", "vy", "vz")], axis=1).astype(np.float32),
         radii=drawn_radii(chosen["radius"], chosen["lifetime"]),
-        own={name: np.ascontiguousarray(chosen[name], np.float32) for name in _ATTRIBUTES if name in rows.dtype.names},
+        own={name: np.ascontiguousarray(chosen[name], np.float32) for name in ATTRIBUTES if name in rows.dtype.names},
     )
 
 
@@ -86,7 +86,7 @@ def fill_points(mesh: Any, points: Points) -> None:
         mesh.attributes["position"].data.foreach_set("vector", points.positions.ravel())
     set_attribute(mesh, "velocity", None if is_empty else points.velocities)
     set_attribute(mesh, "radius", None if is_empty else points.radii)
-    for name, attribute in _ATTRIBUTES.items():
+    for name, attribute in ATTRIBUTES.items():
         set_attribute(mesh, attribute, None if is_empty else points.own.get(name))
     mesh.update()
 

@@ -26,6 +26,7 @@ from blender_scripts import camera, geometry, poses, volumes
 from blender_scripts.errors import RenderInputError
 from blender_scripts.keyframes import forget_keyframes, reach_of_motion
 from blender_scripts.ply import FADE_S, KINDS
+from blender_scripts.points import ATTRIBUTES
 from blender_scripts.render_frames import SceneRenderer
 
 WET_FILES = "blend/{name}/{{frame}}.ply"  # of fluids, with where they touch solids: below the job's folder
@@ -253,7 +254,11 @@ def _points_of_frame(blender_object: Any, file: str, kind: str) -> Any:
     share = nodes.node("ShaderNodeMath", nodes.named("lifetime"), FADE_S, operation="DIVIDE", use_clamp=True)
     fade = nodes.node("ShaderNodeMath", share.outputs[0], 1.0 / 3.0, operation="POWER")
     radius = nodes.node("ShaderNodeMath", nodes.named("radius"), fade.outputs[0], operation="MULTIPLY")
-    return nodes.end(nodes.stored(points, "radius", radius.outputs[0], "FLOAT"))
+    points = nodes.stored(points, "radius", radius.outputs[0], "FLOAT")
+    for column, attribute in ATTRIBUTES.items():
+        if column != attribute:
+            points = nodes.stored(points, attribute, nodes.named(column), "FLOAT")
+    return nodes.end(points)
 
 
 def main(arguments: list[str]) -> int:

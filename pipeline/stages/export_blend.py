@@ -11,7 +11,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.kinds.rigid import meshes_at_rest
-from pipeline.kinds.table import points_of, products_of
+from pipeline.kinds.table import KINDS, points_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage
@@ -79,10 +79,14 @@ class BlendExport(_SceneExport):
     """The scene, and of each frame the fluids as they are drawn; all else it plays are the job's own files."""
 
     format = "blend"
-    version = 2
+    version = 3
     about = "the scene for Blender"
     opened_by = "open {file} in Blender 4.5 LTS or later; it plays the files beside it"
-    refers_to = ("surfaces", "cloths", "animated", "drops", "whitewater", "volumes")
+
+    @property
+    def refers_to(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Folders of all that kinds of bodies make of each frame, and of points of fluids."""
+        return ("drops", "whitewater", *(kind.product.folder for kind in KINDS.values() if kind.product))
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame with fluids that touch something, and one for the scene."""

@@ -28,7 +28,7 @@ class GltfExport(ExportStage):
     """One file of all frames that are chosen: bodies, surfaces, cloths, the camera, plain materials."""
 
     format = "gltf"
-    version = 1
+    version = 2
     about = "a scene for the web"
     opened_by = "drop {file} on a page that shows glTF, or import it in any program; metres, y up"
 

@@ -29,7 +29,7 @@ class UsdExport(ExportStage):
     """A layer of each frame with what changes shape, and the scene that plays them."""
 
     format = "usd"
-    version = 2
+    version = 3
     about = "layers of USD"
     opened_by = "open {file} in any program of USD: Houdini, Maya, usdview, in Blender File > Import > USD"
     refers_to = ("volumes",)

@@ -12,9 +12,11 @@ import numpy as np
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.kinds.fluid import FLUID
 from pipeline.kinds.rigid import is_animated, meshes_at_rest
+from pipeline.kinds.soft import SOFT, is_grainy
 from pipeline.kinds.stored_arrays import unit_of
-from pipeline.kinds.table import bodies, points_of
+from pipeline.kinds.table import bodies, points_of, products_of
 from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
 from pipeline.stages.export import ExportStage, frame_of
@@ -49,8 +51,8 @@ class VtkExport(ExportStage):
         meshes = meshes_at_rest(job.rigid)
         tasks = []
         for frame in self.chosen(job):
-            surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
-            blocks = [file for _, file in _blocks(job, frame)]
+            surfaces = _surfaces(job, layout, frame).values()
+            blocks = [file for _, file in _blocks(job, layout, frame)]
             tasks.append(
                 Task(
                     id=TaskId(f"{self.name}/{frame:06d}"),
@@ -70,6 +72,10 @@ class VtkExport(ExportStage):
         )
         return [*tasks, series]
 
+    def left_out(self, job: Job) -> list[str]:
+        """Grains of soft matter, whose particles are there."""
+        return [f"grains ({each.name})" for each in job.soft if is_grainy(each)]
+
     def run(self, context: TaskContext) -> None:
         """Write the files of a frame, or the series."""
         task, job = context.task, context.job
@@ -85,14 +91,25 @@ def _frame_file(frame: int) -> ArtifactPath:
     return ArtifactPath(f"{FOLDER}/{frame:06d}.vtm")
 
 
-def _blocks(job: Job, frame: int) -> list[tuple[str, ArtifactPath]]:
+def _surfaces(job: Job, layout: JobLayout, frame: int) -> dict[str, ArtifactPath]:
+    """Files of the surfaces around particles, of fluids and of soft matter that has no grains, by body."""
+    return {
+        body.name: file
+        for kind, body, file in products_of(job, layout, frame)
+        if kind is FLUID or (kind is SOFT and not is_grainy(body))
+    }
+
+
+def _blocks(job: Job, layout: JobLayout, frame: int) -> list[tuple[str, ArtifactPath]]:
     """Names of a frame's blocks, and their files."""
-    blocks = []
+    blocks, surfaces = [], _surfaces(job, layout, frame)
     for _, kind, body in bodies(job):
         suffix = "vti" if kind.display.form == "density" else "vtp"
         blocks.append((body.name, suffix))
-        if kind.name == "fluid":
-            blocks += [(f"{body.name}.surface", "vtp"), (f"{body.name}.drops", "vtp")]
+        if body.name in surfaces:
+            blocks.append((f"{body.name}.surface", "vtp"))
+        if kind is FLUID:
+            blocks.append((f"{body.name}.drops", "vtp"))
         if body.name in job.whitewater:
             blocks.append((f"{body.name}.whitewater", "vtp"))
     return [(name, ArtifactPath(f"{FOLDER}/{name}/{frame:06d}.{suffix}")) for name, suffix in blocks]
@@ -109,7 +126,7 @@ class _Frame:
     def write(self, context: TaskContext) -> None:
         """Commit every block, then what names them."""
         writers = dict(self._writers())
-        blocks = _blocks(self._job, self._frame)
+        blocks = _blocks(self._job, self._layout, self._frame)
         for name, artifact in blocks:
             with context.committing(artifact, validate_vtk) as path:
                 writers[name](path)
@@ -118,13 +135,15 @@ class _Frame:
 
     def _writers(self) -> Iterator[tuple[str, Callable[[Path], None]]]:
         of_form = {"mesh": self._mesh, "parts": self._parts, "density": self._cells}
+        surfaces = _surfaces(self._job, self._layout, self._frame)
         for _, kind, body in bodies(self._job):
             if kind.display.form == "points":
                 yield body.name, partial(self._points, body=body, radius=kind.display.radius)
             else:
                 yield body.name, partial(of_form[kind.display.form], body=body)
-            if kind.name == "fluid":
-                yield f"{body.name}.surface", partial(self._surface, name=body.name)
+            if body.name in surfaces:
+                yield f"{body.name}.surface", partial(self._surface, file=surfaces[body.name])
+            if kind is FLUID:
                 drops = self._layout.drops(body.name, self._frame)
                 yield f"{body.name}.drops", partial(self._cloud, file=drops, fades=False)
             if body.name in self._job.whitewater:
@@ -190,8 +209,8 @@ class _Frame:
             time_s=self._time_s,
         )
 
-    def _surface(self, path: Path, *, name: str) -> None:
-        mesh = read_ply(self._layout.path(self._layout.surface(name, self._frame)))
+    def _surface(self, path: Path, *, file: ArtifactPath) -> None:
+        mesh = read_ply(self._layout.path(file))
         values = {
             key: Values(array, unit)
             for key, array, unit in (

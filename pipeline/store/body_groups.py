@@ -1,7 +1,7 @@
 """Groups of rigid bodies in a frame: their poses lie in the rows of four arrays, and each body is read as one of them.
 
 A group of the HDF5 file that has the attribute `bodies` holds so many of them: NAME_1 in the first row, NAME_2 in the
-second. A thousand bodies are four datasets, not four thousand.
+second, unless its attribute `names` has their names. A thousand bodies are four datasets, not four thousand.
 """
 
 from __future__ import annotations
@@ -18,27 +18,32 @@ from sim.core.snapshots import Snapshot
 
 COUNT = "bodies"
 """Attribute of what holds a group: how many bodies are in it."""
+NAMES = "names"
+"""Attribute of what holds a group whose bodies have other names than NAME_1 and so on: one a line, as pieces have."""
 
 
 def packed(bodies: Mapping[str, Snapshot]) -> dict[str, Snapshot]:
-    """Snapshots by name, those of a group as one, by the name of the group, in place of its first body."""
-    members: dict[str, list[Snapshot]] = {}
+    """Snapshots by name, those of a group as one, by the name of the group, in place of its first body.
+
+    Raises ValueError: a group has the name of a body that is none of it.
+    """
+    of_names: dict[str, dict[str, Snapshot]] = {}
     for name, snapshot in bodies.items():
-        if snapshot.group not in (None, name):
-            members.setdefault(str(snapshot.group), []).append(snapshot)
-    whole: dict[str, Snapshot] = {}
-    for name, snapshot in bodies.items():
-        if snapshot.group in (None, name):
-            whole[name] = snapshot
-        elif snapshot.group not in whole:
-            whole[str(snapshot.group)] = _stacked(members[str(snapshot.group)])
-    return whole
+        of_names.setdefault(snapshot.group or name, {})[name] = snapshot
+    if both := [name for name, members in of_names.items() if name in members and len(members) > 1]:
+        raise ValueError(f'"{both[0]}" is a body and a group of others; names are unique in a frame')
+    return {name: members[name] if name in members else _stacked(name, members) for name, members in of_names.items()}
 
 
-def _stacked(members: list[Snapshot]) -> Snapshot:
-    first = members[0]
-    arrays = {key: np.stack([each.arrays[key] for each in members]) for key in first.arrays}
-    return Snapshot(first.kind, arrays, {**first.attributes, COUNT: len(members)})
+def _stacked(group: str, members: Mapping[str, Snapshot]) -> Snapshot:
+    first = next(iter(members.values()))
+    arrays = {key: np.stack([each.arrays[key] for each in members.values()]) for key in first.arrays}
+    named = {} if [*members] == _usual_names(group, len(members)) else {NAMES: "\n".join(members)}
+    return Snapshot(first.kind, arrays, {**first.attributes, COUNT: len(members), **named})
+
+
+def _usual_names(group: str, count: int) -> list[str]:
+    return [f"{group}_{row + 1}" for row in range(count)]
 
 
 class OneOfGroup:
@@ -49,7 +54,7 @@ class OneOfGroup:
     """
 
     def __init__(self, group: str, attributes: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], row: int) -> None:
-        self.attrs = {key: value for key, value in attributes.items() if key != COUNT}
+        self.attrs = {key: value for key, value in attributes.items() if key not in (COUNT, NAMES)}
         self._group, self._arrays, self._row = group, arrays, row
 
     def __getitem__(self, key: str) -> NDArray[Any]:
@@ -76,9 +81,11 @@ class BodyGroups(Mapping[str, Any]):
         self._groups = groups
         self._rows: dict[str, tuple[str, int]] = {}  # of bodies in groups: their group and row
         for name in groups:
-            count = groups[name].attrs.get(COUNT)
-            if count is not None:
-                self._rows |= {f"{name}_{row + 1}": (name, row) for row in range(int(count))}
+            attributes = groups[name].attrs
+            if COUNT in attributes:
+                said = attributes.get(NAMES)
+                members = _usual_names(name, int(attributes[COUNT])) if said is None else str(said).split("\n")
+                self._rows |= {member: (name, row) for row, member in enumerate(members)}
         of_groups = {group for group, _ in self._rows.values()}
         self._names = [*(name for name in groups if name not in of_groups), *self._rows]
         self._read: dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]] = {}

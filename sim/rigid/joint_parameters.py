@@ -207,7 +207,7 @@ def joint_problems(
 ) -> Iterator[JointProblem]:
     """Joints that cannot be, of bodies that may not be there; cloths by name."""
     kinds = {body.name: body.kind for body in bodies}
-    pieces = {body.name for body in bodies if body.whole is not None}
+    broken = {name for body in bodies if body.whole is not None for name in (body.name, body.whole, body.group)}
     names: dict[str, int] = {}
     held: dict[frozenset[str], list[JointParameters]] = {}
     for number, joint in enumerate(joints):
@@ -215,14 +215,16 @@ def joint_problems(
             yield JointProblem(number, "name", f'"{joint.name}" is taken by joint[{names[joint.name]}]; take another')
         names.setdefault(joint.name, number)
         held_cloths = [name for name in joint.between if name in cloths]
+        if breaking := [name for name in joint.between if name in broken]:
+            what = "a piece of a body" if breaking[0] in kinds else "a body"
+            sentence = f'holds "{breaking[0]}", {what} that breaks, which no joint can; remove the joint or breaks'
+            yield JointProblem(number, "between", sentence)
+            continue
         if unknown := [name for name in joint.between if name not in kinds and name not in held_cloths]:
-            known = f"rigid bodies are {', '.join(kinds)}" if kinds else "add [[rigid]]"
+            whole = [name for name in kinds if name not in broken]
+            known = f"rigid bodies are {', '.join(whole)}" if whole else "add [[rigid]]"
             known += f"; cloths are {', '.join(cloths)}" if cloths else ""
             yield JointProblem(number, "between", f'names no rigid body with "{unknown[0]}"; {known}')
-            continue
-        if breaking := [name for name in joint.between if name in pieces]:
-            sentence = f'holds "{breaking[0]}", a piece of a body that breaks, which no joint can; remove one of both'
-            yield JointProblem(number, "between", sentence)
             continue
         if held_cloths:
             yield from _problems_with_cloth(number, joint, kinds, held_cloths, bodies)

@@ -16,7 +16,7 @@ from pipeline.kinds.checks.shapes import build_solids, in_scale
 from pipeline.kinds.rigid import RIGID
 from pipeline.kinds.table import KINDS, bodies, described_material, is_meant, placements
 from pipeline.model.boxes import simulated_regions
-from pipeline.model.groups import of_tables
+from pipeline.model.groups import of_tables, written_place
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, WHITEWATER
 from pipeline.model.positions import KeyPath
@@ -71,17 +71,20 @@ def _check_bodies(job: Job, findings: Findings) -> None:
         findings.warn((), f"has no {', '.join(others[:-1])} or {others[-1]}, so nothing will move")
     # Names become file names, and some file systems do not tell upper from lower case.
     taken: dict[str, KeyPath] = {}
+    told = set()
     for path, kind, body in found:
         other_kind = KINDS.get(body.name)
         if kind.shares_solver is None and other_kind is not None and other_kind.has_shared_solver(job):
             findings.error(
                 (*path, "name"), f'"{body.name}" is what the solver of all [[{body.name}]] is called; take another'
             )
-        if other := taken.get(body.name.casefold()):
-            findings.error(
-                (*path, "name"), f'"{body.name}" is taken by {format_path(other)}; names are unique in a job'
-            )
-        taken.setdefault(body.name.casefold(), path)
+        table = written_place(job, path)
+        for name in dict.fromkeys((body.name, getattr(body, "whole", None), getattr(body, "group", None))):
+            if name is None or (other := taken.setdefault(name.casefold(), table)) == table or (name, table) in told:
+                continue
+            told.add((name, table))
+            says = f'"{name}" is' if name == body.name else f'is of "{name}", a name that is'
+            findings.error((*path, "name"), f"{says} taken by {format_path(other)}; names are unique in a job")
 
 
 def _check_whitewater(job: Job, findings: Findings) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from checked_jobs import Checked, checked
+from checked_jobs import Checked, checked, says
 
 from pipeline import Scene, make_job
 from pipeline.base.errors import JobFileError
@@ -129,7 +129,48 @@ def test_keys_are_set_for_the_group_and_not_for_one_of_it(tmp_path):
 
 def test_a_body_with_the_name_of_one_of_a_group_is_refused(tmp_path):
     told = check(tmp_path, ROOM + BRICKS + BALL.replace('"ball"', '"Brick_2"'))
-    assert any('"Brick_2" is taken by rigid[1]' in line for line in told.errors), told.errors
+    assert any('rigid[1].name: "Brick_2" is taken by rigid[0]' in line for line in told.errors), told.errors
+
+
+CLAY = """
+[[soft]]
+name = "brick"
+material = "clay"
+cell_size = 0.05
+block = [{ shape = { type = "box", size = [0.2, 0.2, 0.2] }, position = [0.5, -0.5, 0.1] }]
+"""
+POT = """
+[[rigid]]
+name = "{}"
+kind = "dynamic"
+density = 2000.0
+shape = {{ type = "box", size = [0.2, 0.2, 0.2] }}
+position = [0.0, 0.5, 0.5]
+breaks = {{ strength = 1e6, pieces = 3 }}
+"""
+
+
+@pytest.mark.parametrize(
+    ("tables", "expected"),
+    [
+        (BRICKS + CLAY, ['soft[0].name: "brick" is taken by rigid[0]']),
+        (BALL.replace('"ball"', '"Brick"') + BRICKS, ['rigid[1].name: ... of "brick", ... taken by rigid[0]']),
+        (POT.format("brick") + CLAY, ['soft[0].name: "brick" is taken by rigid[0]']),
+        (BRICKS + POT.format("brick_5"), ['rigid[1].name: ... of "brick_5", ... taken by rigid[0]']),
+        (POT.format("a") + CLAY.replace("brick", "a_2"), ['soft[0].name: "a_2" is taken by rigid[0]']),
+        (BRICKS + POT.format("a"), []),
+    ],
+)
+def test_names_of_groups_and_of_what_breaks_are_taken_too(tmp_path, tables, expected):
+    lines = [line for line in check(tmp_path, ROOM + tables).errors if "taken" in line]
+    assert len(lines) == len(expected)
+    assert all(says(line, f"many.toml ... {text}") for line, text in zip(lines, expected, strict=True)), lines
+
+
+def test_a_frame_with_a_body_and_a_group_of_one_name_is_refused(tmp_path):
+    brick = BALL.replace('"ball"', '"brick"')
+    with pytest.raises(ValueError, match='"brick" is a body and a group of others'):
+        Scene(job_of(tmp_path, ROOM + BRICKS + brick)).write(tmp_path / "frame.h5")
 
 
 def test_a_mesh_file_of_a_group_is_one_file_at_its_table(tmp_path):
@@ -206,6 +247,21 @@ def test_what_is_read_of_a_frame_is_what_was_written(tmp_path):
     with open_bodies(tmp_path / "frame.h5") as groups:
         assert set(groups) == set(written) and "brick" not in groups
         assert np.array_equal(groups["brick_2"]["position"][()], written["brick_2"].arrays["position"])
+
+
+def test_pieces_of_a_group_are_read_by_their_names(tmp_path):
+    vases = BRICKS.replace('"brick"', '"vase"').replace("[4, 1, 3]", "2").replace("[0.1, 0.05, 0.04]\n", "0.3\n", 2)
+    vases = vases.replace("size = 0.3", "size = [0.1, 0.05, 0.04]") + "breaks = { strength = 1e9, pieces = 3 }\n"
+    scene = Scene(job_of(tmp_path, ROOM + vases + BALL))
+    scene.step()
+    scene.write(tmp_path / "frame.h5")
+    written, read = scene.bodies(), read_frame(tmp_path / "frame.h5").bodies
+    assert [*read] == ["ball", *(f"vase_{body}_{piece}" for body in (1, 2) for piece in (1, 2, 3))]
+    for name, snapshot in written.items():
+        assert not read[name].attributes
+        assert np.array_equal(read[name].arrays["position"], snapshot.arrays["position"])
+    with h5py.File(tmp_path / "frame.h5") as file:
+        assert sorted(file["bodies"]) == ["ball", "vase"]
 
 
 def test_the_library_takes_the_name_of_a_group(tmp_path):

@@ -9,6 +9,7 @@ from planned_jobs import LAYOUT
 from pipeline.base.errors import JobFileError, PipelineError, PlanError
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import job_of_text
+from pipeline.model.job import Job
 from pipeline.run.checked_job import needs_pictures
 from pipeline.run.plan import plan_job
 from pipeline.show.handing_over import refuse_if_busy
@@ -37,6 +38,26 @@ position = [0.0, 0.0, 0.3]
 name = "flag"
 shape = { type = "rectangle", size = [0.4, 0.4], counts = [5, 5] }
 position = [0.0, 0.0, 0.9]
+"""
+EMBERS = """
+[[embers]]
+name = "sparks"
+smoke = "plume"
+source = [{ shape = { type = "sphere", radius = 0.1 }, position = [0.0, 0.0, 0.3], rate = 100.0 }]
+"""
+HEAPS = """
+name = "heaps"
+frames = 3
+[[soft]]
+name = "lump"
+material = "jelly"
+cell_size = 0.05
+block = [{ shape = { type = "box", size = [0.2, 0.2, 0.2] }, position = [-0.2, 0.0, 0.1] }]
+[[soft]]
+name = "heap"
+material = "sand"
+cell_size = 0.05
+block = [{ shape = { type = "box", size = [0.2, 0.2, 0.2] }, position = [0.2, 0.0, 0.1] }]
 """
 BALL = """
 [[rigid]]
@@ -118,10 +139,18 @@ def test_what_is_given_away_ends_with_the_file_to_open(name):
 
 
 def test_every_file_that_a_blend_file_plays_is_given_away_with_it():
-    job = job_of_text(SPLASH + SMOKE.partition("\n\n")[2] + BALL, Path("job.toml"))
+    job = job_of_text(SPLASH + SMOKE.partition("\n\n")[2] + EMBERS + BALL, Path("job.toml"))
+    assert_all_is_given_away(job, {"surfaces", "cloths", "drops", "whitewater", "volumes", "embers"})
+
+
+def test_soft_matter_that_a_blend_file_plays_is_given_away_with_it():
+    assert_all_is_given_away(job_of_text(HEAPS, Path("job.toml")), {"soft"})
+
+
+def assert_all_is_given_away(job: Job, folders: set[str]) -> None:
     files = EXPORTS["blend"].belonging(plan_job(job, LAYOUT, STAGES, ("export-blend",)))
     objects = [each for each in render_spec(job, LAYOUT).objects if "{frame}" in each.file]
-    assert {Path(each.file).parts[0] for each in objects} == {"surfaces", "cloths", "drops", "whitewater", "volumes"}
+    assert {Path(each.file).parts[0] for each in objects} == folders
     for each in objects:
         # Fluids are there as they are drawn.
         file = each.file.replace("surfaces/", "blend/")
@@ -134,6 +163,14 @@ def test_what_copies_points_into_its_own_files_reads_the_drops_of_every_frame(na
     read = {each for task in tasks for each in task.inputs}
     assert {LAYOUT.drops("water", frame) for frame in range(3)} <= read
     assert "drops" not in EXPORTS[name].refers_to
+
+
+def test_paraview_has_surfaces_of_soft_matter_and_says_that_it_has_no_grains():
+    frame = exported(HEAPS, "export-vtk")["export-vtk/000001"]
+    assert "soft/lump/000001.ply" in frame.inputs
+    assert not [each for each in frame.inputs if each.startswith("soft/heap")]
+    assert {Path(each).parts[1] for each in frame.outputs} == {"lump", "lump.surface", "heap", "000001.vtm"}
+    assert EXPORTS["vtk"].left_out(job_of_text(HEAPS, Path("job.toml"))) == ["grains (heap)"]
 
 
 def test_gltf_says_that_it_has_no_drops():

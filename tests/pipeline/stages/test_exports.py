@@ -129,6 +129,35 @@ def test_vtk_reads_drops_with_radii_and_dye_of_the_surface(tmp_path):
     assert array(blocks["water.surface"].GetPointData(), "dye").tolist() == [0.0, 0.25, 1.0]
 
 
+JELLY = """
+name = "tiny"
+frames = 1
+device = "cpu"
+
+[domain]
+min = [-0.5, -0.5, 0.0]
+max = [0.5, 0.5, 1.0]
+
+[[soft]]
+name = "lump"
+material = "jelly"
+cell_size = 0.05
+block = [{ shape = { type = "box", size = [0.2, 0.2, 0.2] }, position = [0.0, 0.0, 0.1] }]
+"""
+
+
+def test_vtk_reads_the_surface_of_soft_matter(tmp_path):
+    studio = Studio.open(tmp_path, JELLY)
+    studio.submit("--until", "soft")
+    studio.run("export", "tiny", "--to", "vtk").assert_code(0)
+    blocks = blocks_of(studio.layout.root / "vtk/000000.vtm")
+    assert blocks.keys() == {"lump", "lump.surface"}
+    mesh = read_ply(studio.layout.root / "soft/lump/000000.ply")
+    assert blocks["lump.surface"].GetNumberOfCells() == len(mesh.faces) > 100
+    np.testing.assert_array_equal(points(blocks["lump.surface"]), mesh.vertices)
+    np.testing.assert_array_equal(array(blocks["lump.surface"].GetPointData(), "velocity"), mesh.velocities)
+
+
 def test_vtk_reads_the_grid_of_smoke_with_x_first(vtk):
     block = blocks_of(vtk.layout.root / f"vtk/{LAST:06d}.vtm")["plume"]
     smoke = cached(vtk, "plume", LAST)

@@ -45,6 +45,19 @@ def test_every_wrong_joint_is_told_at_its_line(tmp_path):
     ]
 
 
+def test_a_joint_of_a_body_that_breaks_is_told_so_by_whatever_name(tmp_path):
+    group = BODIES + "count = 2\nspacing = [0.0, 0.2, 0.0]\nbreaks = { strength = 1e6, pieces = 3 }\n"
+    for name, what in (("arm", "a body"), ("arm_1", "a body"), ("arm_1_2", "a piece of a body")):
+        (line,) = [
+            each for each in checked(group + NAIL.replace("arm", name), tmp_path / "job.toml").errors if "joint" in each
+        ]
+        assert line.endswith(
+            f'between: holds "{name}", {what} that breaks, which no joint can; remove the joint or breaks'
+        )
+    told = checked(group + NAIL.replace("arm", "arn"), tmp_path / "job.toml").errors
+    assert any(line.endswith('names no rigid body with "arn"; rigid bodies are post') for line in told)
+
+
 def test_a_joint_far_from_its_body_is_told(tmp_path):
     far = NAIL.replace('"fixed"', '"ball"') + "anchor = [20.0, 0.0, 0.3]\n"
     lines = [line for line in checked(BODIES + far, tmp_path / "job.toml").warnings if "joint" in line]
