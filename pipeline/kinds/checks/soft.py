@@ -13,7 +13,7 @@ from pipeline.model.amounts import rounded_up
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from sim.coupling.soft_openings import opening_of
+from sim.coupling.soft_openings import opening_of, pours_outside
 from sim.fluid.opening_conflicts import obstruction
 from sim.shapes.filled_volume import Surroundings, amount
 from sim.shapes.placement import PlacedSolid
@@ -61,10 +61,11 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
             filled.append(solid)
             total += particles
         total += sum(round(each.emitted_volume(math.inf) / soft.spacing**3) for each in soft.emitter)
-        _check_emitters(job, index, solids, findings)
     each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0) + (BYTES_BESIDE_CLOTH if job.cloth else 0)
     if refusal := budget.refusal(total, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
+    for index in range(len(job.soft)):
+        _check_emitters(job, index, solids, findings, are_few=refusal is None)
     if job.soft and job.fluid:
         _check_fluid(job.soft[0], job.fluid[0].spacing, findings)
     if job.soft:
@@ -84,8 +85,11 @@ def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings)
         )
 
 
-def _check_emitters(job: Job, index: int, solids: Solids, findings: Findings) -> None:
-    """Refuse openings that are too narrow, outside the domain, or in bodies, and warn of those that come too late."""
+def _check_emitters(job: Job, index: int, solids: Solids, findings: Findings, *, are_few: bool) -> None:
+    """Refuse openings that are too narrow, outside the domain, or in bodies, and warn of those that come too late.
+
+    Their ways are only looked at where there is memory for what they pour.
+    """
     soft = job.soft[index]
     obstacles = [solid for path, solid in solids.items() if path[0] in ("rigid", "soft")]
     for number, emitter in enumerate(soft.emitter):
@@ -97,7 +101,8 @@ def _check_emitters(job: Job, index: int, solids: Solids, findings: Findings) ->
         except ValueError as error:
             findings.error((*path, "shape"), str(error).replace("particle_radius", "cell_size"))
             continue
-        if reason := obstruction(opening, soft.spacing, job.domain, obstacles):
+        reason = obstruction(opening, soft.spacing, job.domain, obstacles)
+        if reason := reason or (pours_outside(opening, job.domain) if are_few else None):
             findings.error(path, reason)
         if opening.start_s >= job.film_s:
             findings.warn(

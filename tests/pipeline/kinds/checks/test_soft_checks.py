@@ -113,3 +113,13 @@ def test_what_emitters_pour_is_counted_and_their_openings_are_looked_at(tmp_path
     ):
         _, output = told(tmp_path, JOB + EMITTER, "--set", f"soft.jelly.emitter.0.{option}")
         assert expected in output
+
+
+def test_openings_whose_keyframes_leave_the_domain_are_refused(tmp_path):
+    path = "soft.jelly.emitter.0.keyframe=[{time_s=0.0,position=[0.0,0.0,0.6]},{time_s=0.5,position=[0.0,0.0,%s]}]"
+    moving = JOB + EMITTER.replace("position = [0.0, 0.0, 0.6]\n", "")
+    code, output = told(tmp_path, moving, "--set", path % "0.9")
+    assert code == 0, output
+    code, output = told(tmp_path, moving, "--set", path % "1.5")
+    assert code == 2
+    assert "soft[0].emitter[0]: its keyframes take its opening out of the domain, where it pours at 0.2" in output
