@@ -58,14 +58,14 @@ def is_grainy(soft: SoftParameters) -> bool:
     return soft.row.law in GRAINY
 
 
-def count_particles(soft: SoftParameters) -> float:
-    """About the particles of a body: what its blocks hold and emitters let in. Raises as `measures_of`."""
-    return _volume(soft) / soft.spacing**3
+def count_particles(soft: SoftParameters, *, until_s: float = math.inf) -> float:
+    """About the particles of a body: what its blocks hold, and emitters let in until a time [s]. Raises as below."""
+    return _volume(soft, until_s) / soft.spacing**3
 
 
-def _volume(soft: SoftParameters) -> float:
-    """Of all that there ever is of a body [m³]. Raises as `measures_of`."""
-    poured = sum(emitter.emitted_volume(math.inf) for emitter in soft.emitter)
+def _volume(soft: SoftParameters, until_s: float = math.inf) -> float:
+    """Of all that there is of a body by a time [s] [m³]. Raises as `measures_of`."""
+    poured = sum(emitter.emitted_volume(until_s) for emitter in soft.emitter)
     return float(sum(measures_of(block).volume for block in soft.block) + poured)
 
 
@@ -125,7 +125,7 @@ MATTER = Product(
     suffix=".ply",
     tools=lambda _job: {name: tool_version(name) for name in ("pysplashsurf", "numpy", "scipy")},
     parameters=lambda job: {"surface": job.surface.model_dump(mode="json")},
-    memory_bytes=lambda _job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft)),
+    memory_bytes=lambda job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft, until_s=job.film_s)),
     write=_write,
     validate=_validate,
     file_bytes=lambda particles: 33.0 * GRAINS_A_PARTICLE * particles,

@@ -35,12 +35,12 @@ SHORTEST_STEP_S = 2.0e-6
 
 
 def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
-    """Note what is wrong with soft bodies; returns their particles."""
+    """Note what is wrong with soft bodies; returns their particles by the film's end."""
     for number, key, message in shared_conflicts(job.soft):
         findings.error(("soft", number, key), message)
     walls = [solid for path, solid in solids.items() if path[0] == "rigid"]
     filled: list[PlacedSolid] = []
-    total = 0
+    total = later = 0
     for index, soft in enumerate(job.soft):
         _check_steps(job, index, soft, findings)
         check_speeds(job, ("soft", index), findings)
@@ -63,9 +63,10 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
                 )
             filled.append(solid)
             total += particles
-        total += sum(round(each.emitted_volume(math.inf) / soft.spacing**3) for each in soft.emitter)
+        total += _poured(soft, job.film_s)
+        later += _poured(soft, math.inf) - _poured(soft, job.film_s)
     each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0) + (BYTES_BESIDE_CLOTH if job.cloth else 0)
-    if refusal := budget.refusal(total, "particles of soft matter", each):
+    if refusal := budget.refusal(total + later, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
     _check_emitters(job, solids, findings, are_few=refusal is None)
     if job.soft and job.fluid:
@@ -73,6 +74,11 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
     if job.soft:
         _check_bodies(job, solids, job.soft[0].cell_size, findings)
     return total
+
+
+def _poured(soft: SoftParameters, until_s: float) -> int:
+    """Particles that emitters let in until a time [s], about."""
+    return sum(round(each.emitted_volume(until_s) / soft.spacing**3) for each in soft.emitter)
 
 
 def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings) -> None:

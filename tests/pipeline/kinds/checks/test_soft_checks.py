@@ -3,6 +3,9 @@
 import pytest
 from command_line import pipeline
 
+from pipeline.job.loading import load_job
+from pipeline.kinds.soft import BASE_BYTES, BYTES_PER_PARTICLE, MATTER
+
 JOB = """\
 name = "it"
 frames = 2
@@ -102,7 +105,7 @@ total_volume = 0.002
 
 
 def test_what_emitters_pour_is_counted_and_their_openings_are_looked_at(tmp_path):
-    code, output = told(tmp_path, JOB + EMITTER)
+    code, output = told(tmp_path, JOB + EMITTER, "--set", "frames=60")
     assert code == 0
     assert "about 10,000 particles of soft matter" in output
     for option, expected in (
@@ -152,3 +155,15 @@ def test_a_block_of_a_wild_speed_and_two_openings_in_one_place_are_told(tmp_path
     code, output = told(tmp_path, JOB + EMITTER + EMITTER)
     assert code == 2
     assert "soft[0].emitter[1]: is the same opening as soft[0].emitter[0], at the same time" in output
+
+
+def test_what_comes_after_the_film_counts_for_the_memory_of_the_solver_alone(tmp_path):
+    poured = ("--set", "soft.jelly.block=[]")
+    code, output = told(tmp_path, JOB + EMITTER, *poured)
+    assert code == 0
+    assert "about 133 particles of soft matter" in output  # 0.004 m³/s for 1/30 s, of 2,000 in all
+    job = load_job(tmp_path / "it.toml", ["soft.jelly.block=[]"])
+    assert MATTER.memory_bytes(job, job.soft[0]) == pytest.approx(BASE_BYTES + BYTES_PER_PARTICLE * 133.3, rel=1e-6)
+    code, output = told(tmp_path, JOB + EMITTER, *poured, "--set", "soft.jelly.emitter.0.total_volume=100")
+    assert code == 2
+    assert "100 million particles of soft matter need 56 GB" in output
