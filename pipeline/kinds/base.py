@@ -80,7 +80,7 @@ class Product:
     folder: str  # of the files in the job's folder
     suffix: str  # of the files
     tools: Callable[[Job], Mapping[str, str]]  # version of each package that does the work
-    parameters: Callable[[Job], Mapping[str, Any]]  # what decides the file besides the cache
+    parameters: Callable[[Job, Any], Mapping[str, Any]]  # what decides the file of a body besides the cache
     memory_bytes: Callable[[Job, Any], int]  # memory of a task
     write: Callable[[Path, Any, Job, int], None]  # makes the file of a body, with so many threads
     validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError

@@ -143,9 +143,8 @@ def _surface_tools(_job: Job) -> dict[str, str]:
     return {name: tool_version(name) for name in ("pysplashsurf", "scipy")}
 
 
-def _surface_parameters(job: Job) -> dict[str, Any]:
-    surface = job.surface.model_dump(mode="json", exclude={"drop_diameter", "drops_per_particle"})
-    return {"surface": surface, "domain": job.domain}
+def _surface_parameters(job: Job, _fluid: FluidParameters) -> dict[str, Any]:
+    return {"surface": job.surface.of_meshes, "domain": job.domain}
 
 
 def _surface_memory(job: Job, fluid: FluidParameters) -> int:

@@ -124,7 +124,7 @@ MATTER = Product(
     folder="soft",
     suffix=".ply",
     tools=lambda _job: {name: tool_version(name) for name in ("pysplashsurf", "numpy", "scipy")},
-    parameters=lambda job: {"surface": job.surface.model_dump(mode="json")},
+    parameters=lambda job, soft: {} if is_grainy(soft) else {"surface": job.surface.of_meshes},
     memory_bytes=lambda job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft, until_s=job.film_s)),
     write=_write,
     validate=_validate,

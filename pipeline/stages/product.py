@@ -27,9 +27,7 @@ class ProductStage(Stage):
         bodies = self._bodies(job)
         if not bodies:
             return []
-        parameters = ParameterSet.of(
-            product.parameters(job), stage=self.name, version=self.version, tools=product.tools(job)
-        )
+        tools = product.tools(job)
         return [
             Task(
                 id=TaskId(f"{self.name}/{body.name}/{frame:06d}"),
@@ -43,6 +41,9 @@ class ProductStage(Stage):
             )
             for body in bodies
             for resources in (Resources(memory_bytes=product.memory_bytes(job, body)),)
+            for parameters in (
+                ParameterSet.of(product.parameters(job, body), stage=self.name, version=self.version, tools=tools),
+            )
             for frame in range(job.frame_count)
         ]
 
