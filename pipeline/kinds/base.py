@@ -86,10 +86,11 @@ class Product:
     validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError
     # files of the body and frame that hold further arrays of it, in the format of the cache
     also_reads: Callable[[str, int], tuple[ArtifactPath, ...]] = lambda _body, _frame: ()
-    file_bytes: Callable[[float], float]  # about the size of a file by the number of the body's elements
+    file_bytes: Callable[[Any, float], float]  # about the size of a body's file by the number of its elements
     about: str = ""  # what they are, in a few words for people
-    # work of a file of a job's body of so many elements
-    work: Callable[[Job, float], Work] = lambda _job, _elements: Work()
+    # work of the file of a job's body of so many elements, and what that is called where bodies differ in it
+    work: Callable[[Job, Any, float], Work] = lambda _job, _body, _elements: Work()
+    work_name: Callable[[Any], str] = lambda _body: ""
     preflight: Callable[[], list[str]] = list  # why this machine cannot make it, a sentence each
 
     def file_of(self, body: str) -> str:

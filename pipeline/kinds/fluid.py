@@ -198,8 +198,8 @@ SURFACE = Product(
     write=_write_surface,
     validate=validate_ply,
     also_reads=lambda fluid, frame: (JobLayout.liquid(fluid, frame),),
-    file_bytes=lambda particles: 4_500.0 * particles ** (2 / 3),
-    work=surface_work,
+    file_bytes=lambda _fluid, particles: 4_500.0 * particles ** (2 / 3),
+    work=lambda job, _fluid, particles: surface_work(job, particles),
 )
 
 FLUID = Kind(

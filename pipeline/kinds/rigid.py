@@ -134,8 +134,8 @@ ANIMATED = Product(
     memory_bytes=lambda _job, _body: BASE_BYTES,
     write=_write_animated,
     validate=validate_ply,
-    file_bytes=lambda _elements: ANIMATED_BYTES,
-    work=lambda _job, _elements: Work(0.0, ANIMATED_S),
+    file_bytes=lambda _body, _elements: ANIMATED_BYTES,
+    work=lambda _job, _body, _elements: Work(0.0, ANIMATED_S),
 )
 
 RIGID = Kind(

@@ -137,8 +137,8 @@ VOLUME = Product(
     memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * ceil(expected_cells(smoke, job.domain)),
     write=_write_volume,
     validate=validate_volume,
-    file_bytes=lambda cells: 20_000 + 3.0 * cells,
-    work=lambda _job, cells: Work(0.0, 0.3e-6 * cells),
+    file_bytes=lambda _smoke, cells: 20_000 + 3.0 * cells,
+    work=lambda _job, _smoke, cells: Work(0.0, 0.3e-6 * cells),
     preflight=_missing_openvdb,
 )
 

@@ -13,7 +13,7 @@ from pipeline.kinds.base import Change, Display, Kind, Materials, Product, Solid
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import SOFT_LIVE
 from pipeline.kinds.sizes import box_of, measures_of
-from pipeline.kinds.work import soft_work
+from pipeline.kinds.work import soft_work, surface_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
@@ -51,6 +51,8 @@ GRAINY = (Law.SAND, Law.SNOW)
 
 BASE_BYTES, BYTES_PER_PARTICLE = 150_000_000, 3_000
 """Of a task that makes a file, with pysplashsurf."""
+SURFACE_BYTES = 2_600.0
+"""Size of a surface's file over the number of its particles to the power 2/3, of cubes of 27,000 and 216,000."""
 
 
 def is_grainy(soft: SoftParameters) -> bool:
@@ -128,8 +130,13 @@ MATTER = Product(
     memory_bytes=lambda job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft, until_s=job.film_s)),
     write=_write,
     validate=_validate,
-    file_bytes=lambda particles: 33.0 * GRAINS_A_PARTICLE * particles,
-    work=lambda _job, particles: Work(0.0, 3.0e-6 * particles),
+    file_bytes=lambda soft, particles: (
+        33.0 * GRAINS_A_PARTICLE * particles if is_grainy(soft) else SURFACE_BYTES * particles ** (2.0 / 3.0)
+    ),
+    work=lambda job, soft, particles: (
+        Work(0.0, 3.0e-6 * particles) if is_grainy(soft) else surface_work(job, particles)
+    ),
+    work_name=lambda soft: "grains" if is_grainy(soft) else "surface",
 )
 
 SOFT = Kind(

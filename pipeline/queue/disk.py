@@ -1,9 +1,9 @@
 """Disk space: how much a job will take, and how much of it stays free."""
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pipeline.base import wording
 from pipeline.kinds.table import KINDS
@@ -44,11 +44,11 @@ class Size(NamedTuple):
     picture_bytes_per_pixel: float = 1.2  # what a picture takes, on the mean of its files [bytes]
     film_factor: float = 1.0  # how much more a film takes than one of H.264 [-]
     drops_per_particle: float = 0.0  # of spray, on average [-]
-    bodies: Mapping[str, int] = {}  # how many of a kind have files of their own; one if not said
+    bodies: Mapping[str, Sequence[Any]] = {}  # those of a kind that have files of their own; one if not said
 
     def mean(self, kind: str) -> float:
         """Elements of a body of a kind, on average; 0 of none."""
-        return self.elements.get(kind, 0.0) / max(1, self.bodies.get(kind, 1))
+        return self.elements.get(kind, 0.0) / max(1, len(self.bodies.get(kind, ())))
 
 
 def size_of(job: Job, findings: Findings) -> Size:
@@ -61,8 +61,9 @@ def size_of(job: Job, findings: Findings) -> Size:
         _PRORES_FACTOR if job.movie.codec == "prores" else 1.0,
         _drops_per_particle(job),
         {
-            name: sum(kind.product is not None and kind.product.of(body) for body in kind.bodies(job))
+            name: [body for body in kind.bodies(job) if kind.product.of(body)]
             for name, kind in KINDS.items()
+            if kind.product is not None
         },
     )
 
@@ -112,7 +113,8 @@ def bytes_per_artifact(stage: str, size: Size) -> float:
     """What one file of a stage takes, about [bytes]; those of a product of bodies by their kind."""
     for name, kind in KINDS.items():
         if kind.product is not None and kind.product.stage == stage:
-            return kind.product.file_bytes(size.mean(name))
+            bodies = size.bodies.get(name, ())
+            return sum(kind.product.file_bytes(body, size.mean(name)) for body in bodies) / max(1, len(bodies))
     return _BYTES_PER_ARTIFACT[stage](size) if stage in _BYTES_PER_ARTIFACT else 0.0
 
 

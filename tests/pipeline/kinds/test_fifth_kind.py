@@ -138,7 +138,7 @@ GRAIN = Kind(
         memory_bytes=lambda job, grain: 100_000_000 + int(100 * count(job, grain)),
         write=write_points,
         validate=validate_point_cloud,
-        file_bytes=lambda grains: 33.0 * grains,
+        file_bytes=lambda _grains, count: 33.0 * count,
     ),
     objects=objects,
     reach=reach,
