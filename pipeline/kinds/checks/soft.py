@@ -150,6 +150,6 @@ def _check_bodies(job: Job, solids: Solids, cell_size: float, findings: Findings
         findings.warn(
             (*path[:2], "breaks"),
             f'"{whole}" has pieces, {len(found)} in all, of less than {FEWEST_CELLS:g} cells of soft matter, '
-            f"{cell_size:g} m, the thinnest of {thin:.3g} m: it may pass through them once they have broken off; use "
-            f"soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or fewer pieces",
+            f'{cell_size:g} m, the thinnest, "{job.rigid[int(path[1])].name}", of {thin:.3g} m: it may pass through '
+            f"them once they have broken off; use soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or fewer pieces",
         )
