@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -51,6 +51,11 @@ class SurfaceParameters(Parameters):
         "than `drop_diameter` where it would take more. 0: nothing breaks up, and lone particles are drawn as balls. "
         "[-]",
     )
+
+    @property
+    def of_meshes(self) -> dict[str, Any]:
+        """The keys that decide a surface, as JSON values: all but those of drops."""
+        return self.model_dump(mode="json", exclude={"drop_diameter", "drops_per_particle"})
 
 
 class VolumeParameters(Parameters):

@@ -270,12 +270,14 @@ def _build_soft(scene: SceneParameters, static: Sequence[StaticBody], forces: Fo
     """One solver for all soft bodies, clear of rigid ones."""
     shapes = SharedShapes()
     movers = [build_solid(body, shapes) for body in scene.rigid if body.kind != "static"]
+    solids = [*(body.solid for body in static), *movers]
+    blocks = [build_solid(block, shapes) for each in scene.soft if each.emitter for block in each.block]
     return SoftSolver(
         scene.soft,
         domain=scene.domain,
         gravity=scene.gravity,
-        solids=[*(body.solid for body in static), *movers],
-        poured=poured_by(scene.soft),
+        solids=solids,
+        poured=poured_by(scene.soft, scene.domain, [*solids, *blocks]),
         forces=forces,
     )
 

@@ -80,16 +80,17 @@ class Product:
     folder: str  # of the files in the job's folder
     suffix: str  # of the files
     tools: Callable[[Job], Mapping[str, str]]  # version of each package that does the work
-    parameters: Callable[[Job], Mapping[str, Any]]  # what decides the file besides the cache
+    parameters: Callable[[Job, Any], Mapping[str, Any]]  # what decides the file of a body besides the cache
     memory_bytes: Callable[[Job, Any], int]  # memory of a task
     write: Callable[[Path, Any, Job, int], None]  # makes the file of a body, with so many threads
     validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError
     # files of the body and frame that hold further arrays of it, in the format of the cache
     also_reads: Callable[[str, int], tuple[ArtifactPath, ...]] = lambda _body, _frame: ()
-    file_bytes: Callable[[float], float]  # about the size of a file by the number of the body's elements
+    file_bytes: Callable[[Any, float], float]  # about the size of a body's file by the number of its elements
     about: str = ""  # what they are, in a few words for people
-    # work of a file of a job's body of so many elements
-    work: Callable[[Job, float], Work] = lambda _job, _elements: Work()
+    # work of the file of a job's body of so many elements, and what that is called where bodies differ in it
+    work: Callable[[Job, Any, float], Work] = lambda _job, _body, _elements: Work()
+    work_name: Callable[[Any], str] = lambda _body: ""
     preflight: Callable[[], list[str]] = list  # why this machine cannot make it, a sentence each
 
     def file_of(self, body: str) -> str:

@@ -96,12 +96,12 @@ MESH = Product(
     folder="cloths",
     suffix=".ply",
     tools=lambda _job: {"numpy": tool_version("numpy")},
-    parameters=lambda _job: {},
+    parameters=lambda _job, _body: {},
     memory_bytes=lambda _job, cloth: BASE_BYTES + BYTES_PER_NODE * count_nodes(cloth),
     write=_write_mesh,
     validate=validate_ply,
-    file_bytes=lambda nodes: 70.0 * nodes,
-    work=lambda _job, nodes: Work(0.0, 2.0e-6 * nodes),
+    file_bytes=lambda _cloth, nodes: 70.0 * nodes,
+    work=lambda _job, _cloth, nodes: Work(0.0, 2.0e-6 * nodes),
 )
 
 CLOTH = Kind(

@@ -62,12 +62,12 @@ POINTS = Product(
     folder="embers",
     suffix=".ply",
     tools=lambda _job: {"numpy": tool_version("numpy")},
-    parameters=lambda _job: {},
+    parameters=lambda _job, _body: {},
     memory_bytes=lambda _job, embers: BASE_BYTES + BYTES_PER_EMBER * embers.most,
     write=_write,
     validate=validate_point_cloud,
-    file_bytes=lambda embers: 37.0 * embers,
-    work=lambda _job, embers: Work(0.0, 1.0e-6 * embers),
+    file_bytes=lambda _embers, count: 37.0 * count,
+    work=lambda _job, _embers, count: Work(0.0, 1.0e-6 * count),
 )
 
 EMBERS = Kind(

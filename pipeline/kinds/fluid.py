@@ -143,9 +143,8 @@ def _surface_tools(_job: Job) -> dict[str, str]:
     return {name: tool_version(name) for name in ("pysplashsurf", "scipy")}
 
 
-def _surface_parameters(job: Job) -> dict[str, Any]:
-    surface = job.surface.model_dump(mode="json", exclude={"drop_diameter", "drops_per_particle"})
-    return {"surface": surface, "domain": job.domain}
+def _surface_parameters(job: Job, _fluid: FluidParameters) -> dict[str, Any]:
+    return {"surface": job.surface.of_meshes, "domain": job.domain}
 
 
 def _surface_memory(job: Job, fluid: FluidParameters) -> int:
@@ -199,8 +198,8 @@ SURFACE = Product(
     write=_write_surface,
     validate=validate_ply,
     also_reads=lambda fluid, frame: (JobLayout.liquid(fluid, frame),),
-    file_bytes=lambda particles: 4_500.0 * particles ** (2 / 3),
-    work=surface_work,
+    file_bytes=lambda _fluid, particles: 4_500.0 * particles ** (2 / 3),
+    work=lambda job, _fluid, particles: surface_work(job, particles),
 )
 
 FLUID = Kind(

@@ -130,12 +130,12 @@ ANIMATED = Product(
     folder="animated",
     suffix=".ply",
     tools=lambda _job: {"numpy": tool_version("numpy")},
-    parameters=lambda _job: {},
+    parameters=lambda _job, _body: {},
     memory_bytes=lambda _job, _body: BASE_BYTES,
     write=_write_animated,
     validate=validate_ply,
-    file_bytes=lambda _elements: ANIMATED_BYTES,
-    work=lambda _job, _elements: Work(0.0, ANIMATED_S),
+    file_bytes=lambda _body, _elements: ANIMATED_BYTES,
+    work=lambda _job, _body, _elements: Work(0.0, ANIMATED_S),
 )
 
 RIGID = Kind(

@@ -133,12 +133,12 @@ VOLUME = Product(
     folder="volumes",
     suffix=".vdb",
     tools=_openvdb,
-    parameters=lambda job: {"volume": job.volume, "fps": job.fps, "shutter": job.render.shutter},
+    parameters=lambda job, _smoke: {"volume": job.volume, "fps": job.fps, "shutter": job.render.shutter},
     memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * ceil(expected_cells(smoke, job.domain)),
     write=_write_volume,
     validate=validate_volume,
-    file_bytes=lambda cells: 20_000 + 3.0 * cells,
-    work=lambda _job, cells: Work(0.0, 0.3e-6 * cells),
+    file_bytes=lambda _smoke, cells: 20_000 + 3.0 * cells,
+    work=lambda _job, _smoke, cells: Work(0.0, 0.3e-6 * cells),
     preflight=_missing_openvdb,
 )
 

@@ -13,7 +13,7 @@ from pipeline.kinds.base import Change, Display, Kind, Materials, Product, Solid
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import SOFT_LIVE
 from pipeline.kinds.sizes import box_of, measures_of
-from pipeline.kinds.work import soft_work
+from pipeline.kinds.work import soft_work, surface_work
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
@@ -51,6 +51,8 @@ GRAINY = (Law.SAND, Law.SNOW)
 
 BASE_BYTES, BYTES_PER_PARTICLE = 150_000_000, 3_000
 """Of a task that makes a file, with pysplashsurf."""
+SURFACE_BYTES = 2_600.0
+"""Size of a surface's file over the number of its particles to the power 2/3, of cubes of 27,000 and 216,000."""
 
 
 def is_grainy(soft: SoftParameters) -> bool:
@@ -58,14 +60,14 @@ def is_grainy(soft: SoftParameters) -> bool:
     return soft.row.law in GRAINY
 
 
-def count_particles(soft: SoftParameters) -> float:
-    """About the particles of a body: what its blocks hold and emitters let in. Raises as `measures_of`."""
-    return _volume(soft) / soft.spacing**3
+def count_particles(soft: SoftParameters, *, until_s: float = math.inf) -> float:
+    """About the particles of a body: what its blocks hold, and emitters let in until a time [s]. Raises as below."""
+    return _volume(soft, until_s) / soft.spacing**3
 
 
-def _volume(soft: SoftParameters) -> float:
-    """Of all that there ever is of a body [m³]. Raises as `measures_of`."""
-    poured = sum(emitter.emitted_volume(math.inf) for emitter in soft.emitter)
+def _volume(soft: SoftParameters, until_s: float = math.inf) -> float:
+    """Of all that there is of a body by a time [s] [m³]. Raises as `measures_of`."""
+    poured = sum(emitter.emitted_volume(until_s) for emitter in soft.emitter)
     return float(sum(measures_of(block).volume for block in soft.block) + poured)
 
 
@@ -124,12 +126,17 @@ MATTER = Product(
     folder="soft",
     suffix=".ply",
     tools=lambda _job: {name: tool_version(name) for name in ("pysplashsurf", "numpy", "scipy")},
-    parameters=lambda job: {"surface": job.surface.model_dump(mode="json")},
-    memory_bytes=lambda _job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft)),
+    parameters=lambda job, soft: {} if is_grainy(soft) else {"surface": job.surface.of_meshes},
+    memory_bytes=lambda job, soft: BASE_BYTES + int(BYTES_PER_PARTICLE * count_particles(soft, until_s=job.film_s)),
     write=_write,
     validate=_validate,
-    file_bytes=lambda particles: 33.0 * GRAINS_A_PARTICLE * particles,
-    work=lambda _job, particles: Work(0.0, 3.0e-6 * particles),
+    file_bytes=lambda soft, particles: (
+        33.0 * GRAINS_A_PARTICLE * particles if is_grainy(soft) else SURFACE_BYTES * particles ** (2.0 / 3.0)
+    ),
+    work=lambda job, soft, particles: (
+        Work(0.0, 3.0e-6 * particles) if is_grainy(soft) else surface_work(job, particles)
+    ),
+    work_name=lambda soft: "grains" if is_grainy(soft) else "surface",
 )
 
 SOFT = Kind(

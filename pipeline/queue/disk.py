@@ -1,9 +1,9 @@
 """Disk space: how much a job will take, and how much of it stays free."""
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pipeline.base import wording
 from pipeline.kinds.table import KINDS
@@ -44,6 +44,11 @@ class Size(NamedTuple):
     picture_bytes_per_pixel: float = 1.2  # what a picture takes, on the mean of its files [bytes]
     film_factor: float = 1.0  # how much more a film takes than one of H.264 [-]
     drops_per_particle: float = 0.0  # of spray, on average [-]
+    bodies: Mapping[str, Sequence[Any]] = {}  # those of a kind that have files of their own; one if not said
+
+    def mean(self, kind: str) -> float:
+        """Elements of a body of a kind, on average; 0 of none."""
+        return self.elements.get(kind, 0.0) / max(1, len(self.bodies.get(kind, ())))
 
 
 def size_of(job: Job, findings: Findings) -> Size:
@@ -55,6 +60,11 @@ def size_of(job: Job, findings: Findings) -> Size:
         _picture_bytes_per_pixel(job),
         _PRORES_FACTOR if job.movie.codec == "prores" else 1.0,
         _drops_per_particle(job),
+        {
+            name: [body for body in kind.bodies(job) if kind.product.of(body)]
+            for name, kind in KINDS.items()
+            if kind.product is not None
+        },
     )
 
 
@@ -83,10 +93,8 @@ _DROP_BYTES = 33.0
 _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
     "simulate": lambda size: 22_000 + _snapshot_bytes(size, 1),
     # Two files a frame: kinds of particles, and drops.
-    "spray": lambda size: (
-        0.5 * size.elements.get("fluid", 0.0) * (1.0 + _SPRAY_SHARE * _DROP_BYTES * size.drops_per_particle)
-    ),
-    "whitewater": lambda size: 10.0 * size.elements.get("fluid", 0.0),
+    "spray": lambda size: 0.5 * size.mean("fluid") * (1.0 + _SPRAY_SHARE * _DROP_BYTES * size.drops_per_particle),
+    "whitewater": lambda size: 10.0 * size.mean("fluid"),
     "bodies": lambda _: 400_000.0,
     "bounds": lambda _: 3000.0,
     "render": lambda size: 1_000 + size.picture_bytes_per_pixel * size.pixels,
@@ -105,7 +113,8 @@ def bytes_per_artifact(stage: str, size: Size) -> float:
     """What one file of a stage takes, about [bytes]; those of a product of bodies by their kind."""
     for name, kind in KINDS.items():
         if kind.product is not None and kind.product.stage == stage:
-            return kind.product.file_bytes(size.elements.get(name, 0.0))
+            bodies = size.bodies.get(name, ())
+            return sum(kind.product.file_bytes(body, size.mean(name)) for body in bodies) / max(1, len(bodies))
     return _BYTES_PER_ARTIFACT[stage](size) if stage in _BYTES_PER_ARTIFACT else 0.0
 
 

@@ -27,9 +27,7 @@ class ProductStage(Stage):
         bodies = self._bodies(job)
         if not bodies:
             return []
-        parameters = ParameterSet.of(
-            product.parameters(job), stage=self.name, version=self.version, tools=product.tools(job)
-        )
+        tools = product.tools(job)
         return [
             Task(
                 id=TaskId(f"{self.name}/{body.name}/{frame:06d}"),
@@ -43,6 +41,9 @@ class ProductStage(Stage):
             )
             for body in bodies
             for resources in (Resources(memory_bytes=product.memory_bytes(job, body)),)
+            for parameters in (
+                ParameterSet.of(product.parameters(job, body), stage=self.name, version=self.version, tools=tools),
+            )
             for frame in range(job.frame_count)
         ]
 
@@ -58,9 +59,15 @@ class ProductStage(Stage):
         return self._kind.lighter
 
     def work(self, job: Job, elements: Mapping[str, float], *, on_gpu: bool) -> FileWork:  # noqa: ARG002
-        """What the kind says of a body with the mean number of elements."""
-        count = elements.get(self._kind.name, 0.0) / max(1, len(self._bodies(job)))
-        return FileWork(self._kind.name, self._product.work(job, count).plus(Work(0.0, FILE_S)))
+        """The mean of what the kind says of each body with the mean number of elements."""
+        bodies, product = self._bodies(job), self._product
+        share = 1.0 / max(1, len(bodies))
+        work = Work(0.0, FILE_S)
+        for body in bodies:
+            own = product.work(job, body, share * elements.get(self._kind.name, 0.0))
+            work = work.plus(Work(share * own.shared_s, share * own.host_s))
+        names = {product.work_name(body) or self._kind.name for body in bodies}
+        return FileWork("+".join(sorted(names)), work)
 
     def run(self, context: TaskContext) -> None:
         """Make the file of one body and frame."""

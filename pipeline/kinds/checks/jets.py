@@ -36,7 +36,7 @@ def check_jets(
     """Warn of jets, of particles of a spacing [m], that cannot leave their opening or run into another one."""
     openings = {path: opening for path, opening in openings.items() if not opening.moves and opening.speed > 0.0}
     bodies = [solid for path, solid in solids.items() if path[0] == "rigid"]
-    blocks = [solid for path, solid in solids.items() if path[0] == "fluid"]
+    blocks = [solid for path, solid in solids.items() if path[0] in ("fluid", "soft")]
     for path, opening in openings.items():
         needed = _room_needed(opening)
         room = _room_before(opening, job.domain, bodies, needed, spacing)

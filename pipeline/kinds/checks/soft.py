@@ -7,14 +7,16 @@ import math
 import numpy as np
 
 from pipeline.kinds.base import Solids
+from pipeline.kinds.checks.jets import check_jets
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.checks.openings import check_opening, check_speeds
 from pipeline.kinds.checks.shapes import mesh_exists
 from pipeline.model.amounts import rounded_up
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from sim.coupling.soft_openings import opening_of
-from sim.fluid.opening_conflicts import obstruction
+from sim.coupling.soft_openings import opening_of, pours_outside
+from sim.fluid.opening import Opening
 from sim.shapes.filled_volume import Surroundings, amount
 from sim.shapes.placement import PlacedSolid
 from sim.soft.parameters import SoftParameters, coarse_for_fluid, shared_conflicts
@@ -33,14 +35,15 @@ SHORTEST_STEP_S = 2.0e-6
 
 
 def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
-    """Note what is wrong with soft bodies; returns their particles."""
+    """Note what is wrong with soft bodies; returns their particles by the film's end."""
     for number, key, message in shared_conflicts(job.soft):
         findings.error(("soft", number, key), message)
     walls = [solid for path, solid in solids.items() if path[0] == "rigid"]
     filled: list[PlacedSolid] = []
-    total = 0
+    total = later = 0
     for index, soft in enumerate(job.soft):
         _check_steps(job, index, soft, findings)
+        check_speeds(job, ("soft", index), findings)
         for number in range(len(soft.block)):
             path = ("soft", index, "block", number)
             if (solid := solids.get(path)) is None:
@@ -60,16 +63,22 @@ def check_soft(job: Job, solids: Solids, budget: MemoryBudget, findings: Finding
                 )
             filled.append(solid)
             total += particles
-        total += sum(round(each.emitted_volume(math.inf) / soft.spacing**3) for each in soft.emitter)
-        _check_emitters(job, index, solids, findings)
+        total += _poured(soft, job.film_s)
+        later += _poured(soft, math.inf) - _poured(soft, job.film_s)
     each = BYTES_PER_PARTICLE + (BYTES_BESIDE_FLUID if job.fluid else 0) + (BYTES_BESIDE_CLOTH if job.cloth else 0)
-    if refusal := budget.refusal(total, "particles of soft matter", each):
+    if refusal := budget.refusal(total + later, "particles of soft matter", each):
         findings.error(("soft", 0, "cell_size"), f"{refusal}; use a larger cell_size")
+    _check_emitters(job, solids, findings, are_few=refusal is None)
     if job.soft and job.fluid:
         _check_fluid(job.soft[0], job.fluid[0].spacing, findings)
     if job.soft:
         _check_bodies(job, solids, job.soft[0].cell_size, findings)
     return total
+
+
+def _poured(soft: SoftParameters, until_s: float) -> int:
+    """Particles that emitters let in until a time [s], about."""
+    return sum(round(each.emitted_volume(until_s) / soft.spacing**3) for each in soft.emitter)
 
 
 def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings) -> None:
@@ -84,25 +93,25 @@ def _check_steps(job: Job, index: int, soft: SoftParameters, findings: Findings)
         )
 
 
-def _check_emitters(job: Job, index: int, solids: Solids, findings: Findings) -> None:
-    """Refuse openings that are too narrow, outside the domain, or in bodies, and warn of those that come too late."""
-    soft = job.soft[index]
-    obstacles = [solid for path, solid in solids.items() if path[0] in ("rigid", "soft")]
-    for number, emitter in enumerate(soft.emitter):
-        path: KeyPath = ("soft", index, "emitter", number)
-        if not mesh_exists(emitter.shape, path, findings):
-            continue
-        try:
-            opening = opening_of(emitter, soft.spacing)
-        except ValueError as error:
-            findings.error((*path, "shape"), str(error).replace("particle_radius", "cell_size"))
-            continue
-        if reason := obstruction(opening, soft.spacing, job.domain, obstacles):
-            findings.error(path, reason)
-        if opening.start_s >= job.film_s:
-            findings.warn(
-                (*path, "start_s"), f"starts at {opening.start_s:g} s, after the film's end at {job.film_s:g} s"
-            )
+def _check_emitters(job: Job, solids: Solids, findings: Findings, *, are_few: bool) -> None:
+    """Note what is wrong with emitters; their ways are only looked at where there is memory for what they pour."""
+    openings: dict[KeyPath, Opening] = {}
+    for index, soft in enumerate(job.soft):
+        for number, emitter in enumerate(soft.emitter):
+            path: KeyPath = ("soft", index, "emitter", number)
+            if not mesh_exists(emitter.shape, path, findings):
+                continue
+            try:
+                opening = opening_of(emitter, soft.spacing)
+            except ValueError as error:
+                findings.error((*path, "shape"), str(error).replace("particle_radius", "cell_size"))
+                continue
+            is_free = check_opening(job, path, opening, openings, solids, findings=findings)
+            if is_free and are_few and (reason := pours_outside(opening, job.domain)):
+                findings.error(path, reason)
+            openings[path] = opening
+    if openings:
+        check_jets(job, solids, openings, job.soft[0].spacing, findings)
 
 
 def _check_fluid(soft: SoftParameters, spacing: float, findings: Findings) -> None:
@@ -141,6 +150,6 @@ def _check_bodies(job: Job, solids: Solids, cell_size: float, findings: Findings
         findings.warn(
             (*path[:2], "breaks"),
             f'"{whole}" has pieces, {len(found)} in all, of less than {FEWEST_CELLS:g} cells of soft matter, '
-            f"{cell_size:g} m, the thinnest of {thin:.3g} m: it may pass through them once they have broken off; use "
-            f"soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or fewer pieces",
+            f'{cell_size:g} m, the thinnest, "{job.rigid[int(path[1])].name}", of {thin:.3g} m: it may pass through '
+            f"them once they have broken off; use soft.cell_size = {thin / FEWEST_CELLS:.2g} or less, or fewer pieces",
         )

@@ -128,7 +128,10 @@ block = [{ shape = { type = "box", size = [0.6, 0.6, 0.2] }, position = [0.0, 0.
 
 @pytest.mark.parametrize(
     ("other", "place", "told"),
-    [(CLOTH, "cloth[0].shape", "more of its group are thin"), (CLAY, "rigid[0].breaks", '"pot" has pieces, ')],
+    [
+        (CLOTH, "cloth[0].shape", "more of its group are thin"),
+        (CLAY, 'rigid[0].breaks: "pot" has pieces, ', 'the thinnest, "pot_'),
+    ],
 )
 def test_pieces_that_cloth_or_soft_matter_may_pass_through_are_told_once(tmp_path, other, place, told):
     """Not one by one, and nothing of walls: edges of pieces are sharp, those of the whole are not."""

@@ -30,6 +30,23 @@ def test_drops_count_with_what_the_spray_breaks_up_into():
     assert disk.bytes_per_artifact("spray", SIZE) == pytest.approx(0.5e6)
 
 
+@pytest.mark.parametrize("kind", ["cloth", "fluid"])
+def test_a_file_of_one_of_ten_bodies_takes_what_one_body_takes(kind):
+    sheet = {"material": "cotton", "shape": {"type": "rectangle", "size": [0.1, 0.1], "counts": [10, 10]}}
+    block = {"shape": {"type": "box", "size": [0.1, 0.1, 0.1]}, "position": [0.0, 0.0, 0.2]}
+    table = sheet if kind == "cloth" else {"particle_radius": 0.01, "block": [block]}
+    stages = ["cloth"] if kind == "cloth" else ["surface", "spray", "whitewater"]
+
+    def bytes_of(count: int) -> list[float]:
+        bodies = [{"name": f"body_{number}", **table} for number in range(count)]
+        job = Job.model_validate({"name": "film", "frames": 1, kind: bodies}, strict=False)
+        size = disk.size_of(job, Findings(elements={kind: 100 * count}))
+        return [disk.bytes_per_artifact(stage, size) for stage in stages]
+
+    assert bytes_of(1)[0] == pytest.approx(70.0 * 100 if kind == "cloth" else 4_500.0 * 100 ** (2 / 3))
+    assert bytes_of(10) == pytest.approx(bytes_of(1))
+
+
 @pytest.mark.parametrize(
     ("radius", "surface", "drops"),
     [

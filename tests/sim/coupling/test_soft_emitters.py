@@ -16,8 +16,8 @@ SPOUT = {"shape": {"type": "disc", "radius": 0.04}, "position": (0.0, 0.0, 0.4),
 FLOW = {"flow_rate": 0.002, "start_s": 0.05, "total_volume": 2.0e-4}
 
 
-def world_of(emitter: dict[str, Any], **tables: Any) -> Any:
-    sand = {"name": "sand", "material": "sand", "young_modulus": 5.0e4, "cell_size": 0.02, "emitter": [emitter]}
+def world_of(*emitters: dict[str, Any], **tables: Any) -> Any:
+    sand = {"name": "sand", "material": "sand", "young_modulus": 5.0e4, "cell_size": 0.02, "emitter": emitters}
     domain = {"min": (-0.15, -0.15, 0.0), "max": (0.15, 0.15, 0.5)}
     return build_world(
         SceneParameters.model_validate({"domain": domain, "soft": [sand], **tables}), frames_per_second=60
@@ -75,3 +75,27 @@ def test_openings_that_are_too_narrow_or_without_an_end_are_refused():
         world_of(SPOUT | {"speed": 1.0})
     with pytest.raises(ValidationError, match="is for emitters of fluids"):
         world_of(SPOUT | FLOW | {"follow": "cart"})
+
+
+def path_to(*place: float) -> list[dict[str, Any]]:
+    return [{"time_s": 0.0, "position": (0.0, 0.0, 0.4)}, {"time_s": 0.5, "position": place}]
+
+
+def test_openings_that_pour_outside_the_domain_or_in_a_solid_are_refused():
+    moving = {key: SPOUT[key] for key in ("shape", "direction")} | {"speed": 0.5, "end_s": 0.6}
+    for place in ((3.0, 0.0, 0.4), (0.0, 0.0, 3.0)):
+        with pytest.raises(ValueError, match=r'soft "sand" emitter\[0\]: its keyframes take its opening out of'):
+            world_of(moving | {"keyframe": path_to(*place)})
+    world_of(moving | {"keyframe": path_to(3.0, 0.0, 0.4), "end_s": 0.05})  # it has ended by then
+    with pytest.raises(ValueError, match="places of its opening are outside the domain"):
+        world_of(SPOUT | FLOW | {"position": (0.0, 0.0, 0.6)})
+    ball = {"name": "ball", "kind": "static", "shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.4)}
+    with pytest.raises(ValueError, match="places of its opening are in a solid body"):
+        world_of(SPOUT | FLOW, rigid=[ball])
+
+
+def test_openings_at_one_place_and_time_are_refused():
+    with pytest.raises(ValueError, match=r'emitter\[1\]: is the same opening as soft "sand" emitter\[0\], at the same'):
+        world_of(SPOUT | FLOW, SPOUT | FLOW)
+    first = SPOUT | {"speed": 0.5, "end_s": 0.1}
+    world_of(first, SPOUT | {"speed": 1.0, "start_s": 0.1, "end_s": 0.2})

@@ -3,6 +3,9 @@
 import pytest
 from command_line import pipeline
 
+from pipeline.job.loading import load_job
+from pipeline.kinds.soft import BASE_BYTES, BYTES_PER_PARTICLE, MATTER
+
 JOB = """\
 name = "it"
 frames = 2
@@ -102,7 +105,7 @@ total_volume = 0.002
 
 
 def test_what_emitters_pour_is_counted_and_their_openings_are_looked_at(tmp_path):
-    code, output = told(tmp_path, JOB + EMITTER)
+    code, output = told(tmp_path, JOB + EMITTER, "--set", "frames=60")
     assert code == 0
     assert "about 10,000 particles of soft matter" in output
     for option, expected in (
@@ -113,3 +116,54 @@ def test_what_emitters_pour_is_counted_and_their_openings_are_looked_at(tmp_path
     ):
         _, output = told(tmp_path, JOB + EMITTER, "--set", f"soft.jelly.emitter.0.{option}")
         assert expected in output
+
+
+def test_openings_whose_keyframes_leave_the_domain_are_refused(tmp_path):
+    path = "soft.jelly.emitter.0.keyframe=[{time_s=0.0,position=[0.0,0.0,0.6]},{time_s=0.5,position=[0.0,0.0,%s]}]"
+    moving = JOB + EMITTER.replace("position = [0.0, 0.0, 0.6]\n", "")
+    code, output = told(tmp_path, moving, "--set", path % "0.9")
+    assert code == 0, output
+    code, output = told(tmp_path, moving, "--set", path % "1.5")
+    assert code == 2
+    assert "soft[0].emitter[0]: its keyframes take its opening out of the domain, where it pours at 0.2" in output
+
+
+@pytest.mark.parametrize(
+    ("option", "code", "expected"),
+    [
+        ("total_volume=1e-7", 2, "emitter[0].total_volume: makes 1e-07 m³ in all, less than half a particle of 1e-06"),
+        ("total_volume=1e-7", 2, "it emits nothing; use more, or cell_size 0.011 m"),
+        ("flow_rate=0.5", 0, "emitter[0].flow_rate: 0.5 m³/s through 0.0079 m² is a jet of 63.7 m/s, which crosses"),
+        (
+            "ramp=[{time_s=1.0,strength=0.0},{time_s=2.0,strength=1.0}]",
+            0,
+            "is 0 whenever it emits in the film's 0.0333",
+        ),
+        ("position=[0.3,0.0,0.012]", 0, "a wall or body is 0.015 m before its opening, where the flow needs 0.034 m"),
+    ],
+)
+def test_emitters_are_looked_at_as_those_of_fluids(tmp_path, option, code, expected):
+    told_code, output = told(tmp_path, JOB + EMITTER, "--set", f"soft.jelly.emitter.0.{option}")
+    assert told_code == code, output
+    assert expected in output
+
+
+def test_a_block_of_a_wild_speed_and_two_openings_in_one_place_are_told(tmp_path):
+    code, output = told(tmp_path, JOB, "--set", "soft.jelly.block.0.velocity=[0,0,-500]")
+    assert code == 0
+    assert "soft[0].block[0].velocity: 500 m/s crosses the whole domain within a frame" in output
+    code, output = told(tmp_path, JOB + EMITTER + EMITTER)
+    assert code == 2
+    assert "soft[0].emitter[1]: is the same opening as soft[0].emitter[0], at the same time" in output
+
+
+def test_what_comes_after_the_film_counts_for_the_memory_of_the_solver_alone(tmp_path):
+    poured = ("--set", "soft.jelly.block=[]")
+    code, output = told(tmp_path, JOB + EMITTER, *poured)
+    assert code == 0
+    assert "about 133 particles of soft matter" in output  # 0.004 m³/s for 1/30 s, of 2,000 in all
+    job = load_job(tmp_path / "it.toml", ["soft.jelly.block=[]"])
+    assert MATTER.memory_bytes(job, job.soft[0]) == pytest.approx(BASE_BYTES + BYTES_PER_PARTICLE * 133.3, rel=1e-6)
+    code, output = told(tmp_path, JOB + EMITTER, *poured, "--set", "soft.jelly.emitter.0.total_volume=100")
+    assert code == 2
+    assert "100 million particles of soft matter need 56 GB" in output
