@@ -27,14 +27,16 @@ def overlapping_pairs(lower: Array, upper: Array, moves: NDArray[np.bool_]) -> t
     boxes = np.concatenate([lower, upper], axis=1)
     axis = int(np.argmax(np.std(lower, axis=0)))
     order = np.argsort(boxes[:, axis], kind="stable").astype(np.int32)
-    numbers, room = np.zeros(len(order), dtype=np.int32), PAIRS_OF_A_BOX
-    while True:
-        pairs = np.zeros((len(order), room, 2), dtype=np.int32)
-        overlapping_boxes(boxes, axis, order, moves.astype(np.int32), numbers, pairs)
-        if (most := int(numbers.max(initial=0))) <= room:
-            break
-        room = most
-    first, second = pairs[np.arange(room) < numbers[:, None]].astype(np.int64).T
+    n, moved = len(order), moves.astype(np.int32)
+    numbers, room = np.zeros(n, dtype=np.int32), PAIRS_OF_A_BOX
+    starts, pairs = room * np.arange(n, dtype=np.int32), np.zeros((n * room, 2), dtype=np.int32)
+    overlapping_boxes(boxes, axis, order, moved, room, starts, numbers, pairs)
+    if int(numbers.max(initial=0)) > room:  # a large body among many: each place gets as much room as it needs
+        starts, pairs = (np.cumsum(numbers) - numbers).astype(np.int32), np.zeros((int(numbers.sum()), 2), np.int32)
+        overlapping_boxes(boxes, axis, order, moved, int(numbers.max()), starts, numbers, pairs)
+    else:
+        pairs = pairs[(np.arange(room) < numbers[:, None]).ravel()]
+    first, second = pairs.astype(np.int64).T
     order = np.lexsort((second, first))
     return first[order], second[order]
 

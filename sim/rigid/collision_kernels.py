@@ -18,7 +18,6 @@ from sim.rigid.contact_kernels import tangents_of
 from sim.rigid.contacts import FEATURE_BITS, KEPT_BONUS, MOST_PATCHES, SAME_PATCH, WALL_BITS
 
 Vector8 = ti.types.vector(8, ti.f64)
-PairsOfPlaces = ti.types.ndarray(dtype=ti.i32, ndim=3)
 Index8 = ti.types.vector(8, ti.i32)
 
 SPHERE, BOX, CYLINDER, CAPSULE, TORUS, CONE, PROFILE, GRID = range(8)
@@ -664,12 +663,20 @@ def place_contacts(
 
 
 @kernel_of_host_arrays
-def overlapping_boxes(boxes: Rows, axis: ti.i32, order: Whole, moves: Whole, numbers: Whole, pairs: PairsOfPlaces):
-    """Count, and write as far as there is room, for each place in the order of lower corners the boxes it overlaps.
+def overlapping_boxes(
+    boxes: Rows,
+    axis: ti.i32,
+    order: Whole,
+    moves: Whole,
+    room: ti.i32,
+    starts: Whole,
+    numbers: Whole,
+    pairs: WholeRows,
+):
+    """Count for each place in the order of lower corners the boxes it overlaps, and write the first `room` of them.
 
     Of two the one that comes first in order has the pair. One of both moves.
     """
-    room = pairs.shape[1]
     for place in range(order.shape[0]):
         one, count, other_place = order[place], 0, place + 1
         while other_place < order.shape[0]:
@@ -681,8 +688,8 @@ def overlapping_boxes(boxes: Rows, axis: ti.i32, order: Whole, moves: Whole, num
                 overlap &= boxes[one, side] <= boxes[two, 3 + side] and boxes[two, side] <= boxes[one, 3 + side]
             if overlap:
                 if count < room:
-                    pairs[place, count, 0] = ti.min(one, two)
-                    pairs[place, count, 1] = ti.max(one, two)
+                    pairs[starts[place] + count, 0] = ti.min(one, two)
+                    pairs[starts[place] + count, 1] = ti.max(one, two)
                 count += 1
             other_place += 1
         numbers[place] = count
