@@ -72,8 +72,8 @@ MATERIALS: dict[str, MaterialRow] = {
 }
 """The materials, by name. Elastic moduli of grains and clays are those of bulk, lowered as far as shapes bear: real
 sand of some 1e7 Pa needs a third of the step. Packed snow bears E times its critical stretch in tension, 10 kPa, as
-Jamieson & Johnston 1990 found at its density, 79.7 kPa (rho/917)^2.39; its energy is the upper end of what is measured
-of snow, 0.1 to 1 J/m² (Sigrist & Schweizer 2007)."""
+Jamieson & Johnston 1990 found at its density, 79.7 kPa (rho/917)^2.39; its energy is within what breaking layers of
+snow took, 0.08 to 2.7 J/m² (van Herwijnen et al. 2016)."""
 
 
 LAW_KEYS: dict[str, Law] = {
