@@ -265,7 +265,7 @@ def test_a_smoke_that_outgrows_memory_ends_at_its_last_frame_and_goes_on_where_t
         ended = simulate(layout, frames=40, job=RISING)
     assert isinstance(ended, Failed)
     assert ended.kind is FailureKind.OUTGROWN
-    numbers = r'smoke "plume" grows at [0-9.]+ s from [0-9,]+ to [0-9,]+ cells: [0-9,]+ more need .* at most 53 fit'
+    numbers = r'smoke "plume" grows at [0-9.]+ s from [0-9,]+ to [0-9,]+ cells: [0-9,]+ more need .* at most 52 fit'
     assert re.fullmatch(numbers, ended.message), ended.message
     reached = len(list(layout.path(layout.frame_cache(0)).parent.glob("[0-9]*.h5")))
     assert 1 < reached < 40
