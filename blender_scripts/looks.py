@@ -288,14 +288,7 @@ def _sand(builder: NodeBuilder, context: LookContext) -> None:
         light = (min(1.0, 1.3 * red), min(1.0, 1.3 * green), min(1.0, 1.35 * blue))
         return builder.ramp(number, (0.04, dark), (0.15, (0.8 * red, 0.8 * green, 0.8 * blue)), (0.95, light))
 
-    color = _with_dye(builder, context, shaded(or_default(context.color, (0.56, 0.40, 0.24))), shaded)
-    shader = builder.node(
-        "ShaderNodeBsdfPrincipled",
-        Base_Color=color,
-        Roughness=or_default(context.roughness, 0.75),
-        Specular_IOR_Level=0.3,
-    )
-    builder.surface(shader)
+    _even(builder, context, color=(0.56, 0.40, 0.24), roughness=0.75, shaded=shaded, Specular_IOR_Level=0.3)
 
 
 @draws("snow")
@@ -353,12 +346,20 @@ def _metal(builder: NodeBuilder, context: LookContext) -> None:
     _even(builder, context, color=color, roughness=roughness, Metallic=1.0)
 
 
-def _even(builder: NodeBuilder, context: LookContext, *, color: Any, roughness: Any, **inputs: float) -> None:
-    """An opaque surface of one colour; other inputs of the shader by name."""
+def _even(
+    builder: NodeBuilder,
+    context: LookContext,
+    *,
+    color: Any,
+    roughness: Any,
+    shaded: Callable[[Any], Any] = lambda color: color,
+    **inputs: float,
+) -> None:
+    """An opaque surface of one colour, or of shades of one; other inputs of the shader by name."""
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=_with_dye(builder, context, or_default(context.color, color)),
+            Base_Color=_with_dye(builder, context, shaded(or_default(context.color, color)), shaded),
             Roughness=or_default(context.roughness, roughness),
             **inputs,
         )

@@ -80,7 +80,8 @@ class Product:
     folder: str  # of the files in the job's folder
     suffix: str  # of the files
     tools: Callable[[Job], Mapping[str, str]]  # version of each package that does the work
-    parameters: Callable[[Job, Any], Mapping[str, Any]]  # what decides the file of a body besides the cache
+    # what decides the file of a body besides the cache
+    parameters: Callable[[Job, Any], Mapping[str, Any]] = lambda _job, _body: {}
     memory_bytes: Callable[[Job, Any], int]  # memory of a task
     write: Callable[[Path, Any, Job, int], None]  # makes the file of a body, with so many threads
     validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError
@@ -123,9 +124,7 @@ class Kind:
     snapshot_bytes: tuple[float, float, float] = (0.0, 0.0, 0.0)
     method: Callable[[Any], str] = lambda _body: ""  # how a body is computed, where that makes a difference in time
     # work of a frame of all bodies of a job, by the number of their elements
-    work: FrameWork = lambda _job, _elements, _on_gpu: (
-        Work()
-    )  # work of a frame of all bodies of a job, by the number of their elements
+    work: FrameWork = lambda _job, _elements, _on_gpu: Work()
     solver_bytes: float = 0.0  # memory of an element while it is simulated on a CPU, as measured
     compiling_s: float = 0.0  # time of compiling its kernels on the reference machine, once [s]
     drawing: float = 0.0  # time that its bodies add to a picture, over that of a scene of one fluid [-]

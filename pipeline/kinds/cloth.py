@@ -96,7 +96,6 @@ MESH = Product(
     folder="cloths",
     suffix=".ply",
     tools=lambda _job: {"numpy": tool_version("numpy")},
-    parameters=lambda _job, _body: {},
     memory_bytes=lambda _job, cloth: BASE_BYTES + BYTES_PER_NODE * count_nodes(cloth),
     write=_write_mesh,
     validate=validate_ply,

@@ -62,7 +62,6 @@ POINTS = Product(
     folder="embers",
     suffix=".ply",
     tools=lambda _job: {"numpy": tool_version("numpy")},
-    parameters=lambda _job, _body: {},
     memory_bytes=lambda _job, embers: BASE_BYTES + BYTES_PER_EMBER * embers.most,
     write=_write,
     validate=validate_point_cloud,

@@ -130,7 +130,6 @@ ANIMATED = Product(
     folder="animated",
     suffix=".ply",
     tools=lambda _job: {"numpy": tool_version("numpy")},
-    parameters=lambda _job, _body: {},
     memory_bytes=lambda _job, _body: BASE_BYTES,
     write=_write_animated,
     validate=validate_ply,

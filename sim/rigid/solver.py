@@ -281,6 +281,16 @@ class RigidSolver:
         points = None if joints is None else joints.points.state()
         if joints is not None:
             joints.points.push(dt)
+
+        def put_back() -> None:
+            """Let all be as it was when the step began."""
+            if joints is not None and points is not None:
+                joints.points.set_state(points)
+            bodies.position, bodies.orientation = before
+            bodies.velocity, bodies.angular_velocity = velocities
+            if glue is not None:
+                glue.scatter()
+
         self._detector.find(self._poses_described(), self._with_obstacles(reach), among, time_s)
         step = None if joints is None else joints.begin(bodies, dt, is_active, bodies.inverse_inertia())
         carried = partial(self._carried, time_s=time_s + 0.5 * dt) if self.deforming else None
@@ -292,10 +302,7 @@ class RigidSolver:
             friction = self.surfaces.of_pairs(*pieces)[0]
             broken = glue.overloaded(contacts, pieces, friction, outcome.impulses, unstopped, dt, everybody)
             if len(broken) and rounds > 0:
-                if joints is not None and points is not None:
-                    joints.points.set_state(points)
-                bodies.velocity, bodies.angular_velocity = velocities
-                glue.scatter()
+                put_back()
                 glue.split(broken)
                 self._obey_links()
                 self._advance(dt, time_s, everybody, halvings, rounds - 1)
@@ -304,11 +311,7 @@ class RigidSolver:
         if looks > 0:
             got = np.where(moves, dt * self._surface_speeds(), 0.0)
             if self._misses(dt, reach, got, moves):
-                if joints is not None and points is not None:
-                    joints.points.set_state(points)
-                bodies.velocity, bodies.angular_velocity = velocities
-                if glue is not None:
-                    glue.scatter()
+                put_back()
                 self._advance(dt, time_s, everybody, halvings, rounds, np.maximum(reach, got), looks - 1)
                 return
         self._contact_count = self._detector.active_count()
@@ -328,12 +331,8 @@ class RigidSolver:
                 extra=outcome.extra[:-1],
                 is_held=outcome.is_held,
             )
-            if hold.is_too_long and halvings > 0 and points is not None:
-                joints.points.set_state(points)
-                bodies.position, bodies.orientation = before
-                bodies.velocity, bodies.angular_velocity = velocities
-                if glue is not None:
-                    glue.scatter()
+            if hold.is_too_long and halvings > 0:
+                put_back()
                 for half in range(2):
                     self._advance(0.5 * dt, time_s + half * 0.5 * dt, everybody, halvings - 1)
                 return
