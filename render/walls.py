@@ -182,7 +182,24 @@ def _film(
     thickness, *momentum = (gaussian_filter(each.reshape(cells), WIDTH_IN_SPACINGS, mode="nearest") for each in sums)
     velocity = np.stack(momentum, axis=-1) / np.maximum(thickness, np.finfo(np.float32).tiny)[..., None]
     u, v = np.clip(np.round(place_in_cells).astype(int), 0, cells - 1).T
-    return _Film(near, (u, v), thickness, velocity, origin)
+    has_particles = np.zeros(cells, bool)
+    has_particles[u, v] = True
+    return _Film(near, (u, v), np.where(_closed(has_particles), thickness, 0.0), velocity, origin)
+
+
+def _closed(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells of a lattice, (nu, nv), with the gaps between them, which the Gaussian closes; but nothing beyond them.
+
+    What is left of a liquid's uppermost layer at a wall would otherwise be a film that climbs it.
+    """
+    from scipy.ndimage import binary_closing
+
+    reach = int(np.ceil(1.5 * WIDTH_IN_SPACINGS))
+    across = np.arange(-reach, reach + 1)
+    disc = np.add.outer(across**2, across**2) <= reach**2
+    around = np.pad(cells, 2 * reach, mode="edge")  # beyond an edge of the wall it goes on
+    closed: NDArray[np.bool_] = binary_closing(around, disc)[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+    return closed
 
 
 def mirrored(

@@ -189,7 +189,7 @@ def _facts(fluid: FluidParameters, count: float | None) -> str:
 SURFACE = Product(
     stage="surface",
     about="surfaces of fluids",
-    version=5,
+    version=6,
     folder="surfaces",
     suffix=".ply",
     tools=_surface_tools,

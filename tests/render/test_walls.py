@@ -96,6 +96,17 @@ def test_still_water_in_a_tank_has_no_film_and_keeps_its_level():
     assert abs(enclosed_volume(water) / (len(block) * D**3) - 1) < abs(enclosed_volume(free) / (len(block) * D**3) - 1)
 
 
+def test_water_whose_uppermost_layer_has_gaps_climbs_no_wall():
+    """As a block has that keeps its mass: what is left of the layer at the walls has few neighbours."""
+    axes = [(np.arange(count) + 0.5) * D for count in (16, 16, 6)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    is_left = np.random.default_rng(0).uniform(size=len(places)) < 0.54
+    water = places[(places[:, 2] < 5.0 * D) | is_left].astype(np.float32)
+    tank = Walls(np.zeros(3), np.array([16.0 * D, 16.0 * D, np.inf]))
+    surface = mesh_of(water, tank, volume=len(water) * D**3)
+    assert surface.vertices[:, 2].max() < 6.5 * D
+
+
 def test_what_is_behind_a_wall_as_a_whole_is_left_out_and_the_rest_folded_onto_it():
     sphere = mesh_of(ball(), Walls.nowhere())
     across, behind = sphere.vertices, sphere.vertices - np.array([1.0, 0.0, 0.0], np.float32)
