@@ -102,7 +102,10 @@ def require_ends(until: Sequence[str], stages: Sequence[Stage]) -> dict[str, fro
 
     Raises PlanError: there is no such stage, or frames are none.
     """
-    ends = dict(map(parse_end, until))
+    ends: dict[str, frozenset[int] | None] = {}
+    for name, frames in map(parse_end, until):
+        others = ends.get(name, frozenset())
+        ends[name] = None if frames is None or others is None else others | frames
     names = [stage.name for stage in stages]
     for name in ends:
         if name not in names:

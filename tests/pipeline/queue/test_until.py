@@ -184,3 +184,13 @@ def test_exports_are_planned_only_where_they_are_asked_for():
     assert stages_until("export-vtk") == ["simulate", "spray", "surface", "export-vtk"]
     assert not [stage for stage in stages_until() if stage.startswith("export")]
     assert tuple(EXPORTS) == FORMATS
+
+
+@pytest.mark.parametrize(
+    ("until", "frames"),
+    [(("surface:1", "surface:0"), {0, 1}), (("surface:1", "surface"), {0, 1}), (("surface:1",), {1})],
+)
+def test_a_stage_that_is_named_more_than_once_makes_all_that_is_named(until, frames):
+    job = job_of_text(SCENE, Path("job.toml"))
+    tasks = plan_job(job, JobLayout(Path("renders/small")), STAGES, until)
+    assert {task.frame for task in tasks if task.stage == "surface"} == frames
